@@ -13,7 +13,7 @@ from lidarslam.cli import main
 from lidarslam.commands.options import take_config
 from lidarslam.commands.runs import run
 from lidarslam.config.settings import load_config
-from lidarslam.merge.merge import MergedRecording, MergeOutcome, MergeSummary
+from lidarslam.merge.merge import MergedRecording, MergeOutcome
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
@@ -118,9 +118,8 @@ def test_merge_exits_as_run_does_and_says_who_is_left_out(
     recording, tmp_path, monkeypatch, joined, astray, stopped, status
 ):
     entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, 0, joined or n == 1) for n in (1, 2))
-    summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
     tracked = Mock(metrics=None, summary=Mock(went_astray=astray))
-    outcome = MergeOutcome(summary, (tracked, None), stopped)
+    outcome = MergeOutcome(entries, (tracked, None), stopped, 1.0, None, WrittenMap(10, 0.1, 0), ())
     monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
     command = ("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder")
     result = lidarslam(*command)

@@ -208,13 +208,18 @@ class MergedRecording:
     joined: bool  # whether its poses are in the common frame
 
 
+# In the summary of a run; that of the merge says how to correct it.
+_OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
+
+
 @dataclass(frozen=True)
-class MergeSummary:
-    """The content of summary.json of a merge."""
+class MergeOutcome:
+    """A merge that was written."""
 
     recordings: tuple[MergedRecording, ...]
+    runs: tuple[RunOutcome | None, ...]  # of each recording; None where none of its scans could be used
+    stopped: tuple[str, ...]  # which recordings ended before their last scan, and why, a line each
     elapsed_s: float
-    peak_rss_mb: float
     graph: GraphSummary | None
     map: WrittenMap
     warnings: tuple[str, ...]
@@ -224,29 +229,16 @@ class MergeSummary:
         """Number of lost scans of all recordings."""
         return sum(recording.lost_scans for recording in self.recordings)
 
-    def to_json(self) -> dict[str, Any]:
-        """The content of summary.json."""
-        own = {name: getattr(self, name) for name in ("elapsed_s", "peak_rss_mb", "lost_scans")}
-        recordings = [vars(recording) for recording in self.recordings]
-        return {"recordings": recordings} | own | graph_and_map_json(self.graph, self.map, self.warnings)
-
-
-# In the summary of a run; that of the merge says how to correct it.
-_OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
-
-
-@dataclass(frozen=True)
-class MergeOutcome:
-    """A merge that was written."""
-
-    summary: MergeSummary  # in numbers
-    runs: tuple[RunOutcome | None, ...]  # of each recording; None where none of its scans could be used
-    stopped: tuple[str, ...]  # which recordings ended before their last scan, and why, a line each
-
     @property
     def apart(self) -> list[str]:
         """The directories of the recordings that are not in the common map."""
-        return [one.directory for one in self.summary.recordings if not one.joined and one.directory is not None]
+        return [one.directory for one in self.recordings if not one.joined and one.directory is not None]
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        own = {"elapsed_s": self.elapsed_s, "peak_rss_mb": peak_rss_mb(), "lost_scans": self.lost_scans}
+        recordings = [vars(recording) for recording in self.recordings]
+        return {"recordings": recordings} | own | graph_and_map_json(self.graph, self.map, self.warnings)
 
 
 @dataclass(eq=False)
@@ -275,19 +267,18 @@ def write_merge(
     """Optimise the graph, and write the runs and the common map."""
     global_map = parts[0].request.config.global_map
     result, voxel_size_m = graph.finish(), global_map.voxel_size_m
-    finished = None
+    finished, common, joined = None, None, []
     if result is not None and voxel_size_m is not None:
         finished = FinishedGraph(graph, result, voxel_size_m, global_map.most_points)
-    joined = [] if finished is None else finished.joined
+        joined = finished.joined
     runs = tuple(_write_run(part, finished, index, index in joined) for index, part in enumerate(parts))
-    common = None if finished is None else finished.common()
     # First, because it identifies the other files.
     directory.write_text(files.CONFIG, dump_yaml(request.config, request.describe()))
     written, beyond = WrittenMap(0, voxel_size_m, 0), None
-    if result is not None and common is not None:
+    if finished is not None and (common := finished.common()) is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(common.keyframe_poses, common.edges))
-        tracked = ((index, read_part(parts[index].request.out)) for index in joined)
-        views = PlacedViews.join([one.views.placed(result.scan_poses(n)[: len(one.log)]) for n, one in tracked])
+        tracked = ((finished.result.scan_poses(index), read_part(parts[index].request.out)) for index in joined)
+        views = PlacedViews.join([one.views.placed(poses[: len(one.log)]) for poses, one in tracked])
         drawn = draw(common.global_map, views, request.config.global_map, directory)
         if drawn.failure is not None:
             raise drawn.failure
@@ -304,21 +295,22 @@ def write_merge(
         )
         for index, (part, run) in enumerate(zip(parts, runs, strict=True))
     )
-    summary = MergeSummary(
-        recordings=recordings,
-        elapsed_s=time.perf_counter() - started,
-        peak_rss_mb=peak_rss_mb(),
-        graph=None if common is None else common.summary,
-        map=written,
-        warnings=(*_warnings(recordings, runs), *missing(parts), *filter(None, [beyond])),
-    )
-    directory.write_json(files.SUMMARY, summary.to_json())
     stopped = [
         f"{part.request.source}: stopped after {run.summary.scans} scans: {run.stopped}"
         for part, run in zip(parts, runs, strict=True)
         if run is not None and run.stopped is not None
     ]
-    return MergeOutcome(summary, runs, (*stopped, *missing(parts)))
+    outcome = MergeOutcome(
+        recordings=recordings,
+        runs=runs,
+        stopped=(*stopped, *missing(parts)),
+        elapsed_s=time.perf_counter() - started,
+        graph=None if common is None else common.summary,
+        map=written,
+        warnings=(*_warnings(recordings, runs), *missing(parts), *filter(None, [beyond])),
+    )
+    directory.write_json(files.SUMMARY, outcome.to_json())
+    return outcome
 
 
 def _write_run(part: Part, finished: FinishedGraph | None, index: int, is_joined: bool) -> RunOutcome | None:
@@ -353,17 +345,17 @@ def _warnings(recordings: Sequence[MergedRecording], runs: Sequence[RunOutcome |
 
 def format_merge(out: Path, outcome: MergeOutcome) -> str:
     """A merge in a few lines: each recording, the loops between them, the common map, warnings, and the directory."""
-    summary = outcome.summary
-    lines = [_recording(recording, run) for recording, run in zip(summary.recordings, outcome.runs, strict=True)]
-    closed = [loop for loop in (() if summary.graph is None else summary.graph.loops) if loop.accepted]
+    recordings, graph = outcome.recordings, outcome.graph
+    lines = [_recording(recording, run) for recording, run in zip(recordings, outcome.runs, strict=True)]
+    closed = [loop for loop in (() if graph is None else graph.loops) if loop.accepted]
     between = sum(len(set(loop.recordings or ())) > 1 for loop in closed)
     lines.append(
-        f"{sum(one.joined for one in summary.recordings)} of {len(summary.recordings)} recordings in one map;"
+        f"{sum(one.joined for one in recordings)} of {len(recordings)} recordings in one map;"
         f" loops closed: {between} between recordings, {len(closed) - between} within"
     )
-    lines += [format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
-    if summary.lost_scans:
-        lost = count(summary.lost_scans, "scan")
+    lines += [format_map(outcome.map), *(f"warning: {warning}" for warning in outcome.warnings)]
+    if outcome.lost_scans:
+        lost = count(outcome.lost_scans, "scan")
         lines.append(f"tracking was lost on {lost}; the summaries of the recordings say where")
     return joined([*lines, f"written to {out}"])
 

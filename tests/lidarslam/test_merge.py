@@ -72,7 +72,7 @@ def merged(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
 @pytest.mark.long
 def test_all_that_find_one_another_are_in_the_frame_of_the_first(merged, places):
     out, outcome = merged
-    assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
+    assert [recording.joined for recording in outcome.recordings] == [True, False, True]
     T_office_common = read_tum(places["first"] / "ground_truth.tum").T_world_lidar[0]
     shifts = []
     for name, place in (("01_first", "first"), ("03_second", "second")):
@@ -92,7 +92,7 @@ def test_all_that_find_one_another_are_in_the_frame_of_the_first(merged, places)
 def test_the_common_map_holds_what_is_joined_and_nothing_else(merged):
     out, outcome = merged
     common = load_map(out).points
-    assert len(common) == outcome.summary.map.points > 0
+    assert len(common) == outcome.map.points > 0
     first, foreign, second = (load_map(out / name).points for name in PARTS)
     distances = cKDTree(np.concatenate([first, second])).query(common)[0]
     assert np.quantile(distances, 0.999) < 0.1  # a voxel
@@ -142,7 +142,7 @@ def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(merged, p
         (turned / "timestamps.txt").write_bytes((place / "timestamps.txt").read_bytes())
     sources = [tmp_path / name for name in ("first", "foreign", "second")]
     outcome = merge(request(tmp_path / "merged", *sources, settings=("reader.mounting=left",)), quiet)
-    assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
+    assert [recording.joined for recording in outcome.recordings] == [True, False, True]
     np.testing.assert_allclose(load_map(tmp_path / "merged").points, load_map(merged[0]).points)
     for name in PARTS:
         found, expected = (load_run(out / name) for out in (tmp_path / "merged", merged[0]))
@@ -209,12 +209,12 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms, t
     for scan in rooms[1].glob("*.npy"):
         scan.write_bytes(b"not an array")
     outcome = merge(request(tmp_path / "out", *rooms, settings=FAST), quiet)
-    assert [recording.scans for recording in outcome.summary.recordings] == [4, 0, 5]
-    assert [recording.directory for recording in outcome.summary.recordings] == ["01_in_room_0", None, "03_in_room_2"]
+    assert [recording.scans for recording in outcome.recordings] == [4, 0, 5]
+    assert [recording.directory for recording in outcome.recordings] == ["01_in_room_0", None, "03_in_room_2"]
     assert not (tmp_path / "out" / "02_in_room_1").exists()
     (stopped,) = outcome.stopped
     assert "no scan could be used: 5 scans were left out: not readable" in stopped
-    assert any("1 scan was left out: not readable" in warning for warning in outcome.summary.warnings)
+    assert any("1 scan was left out: not readable" in warning for warning in outcome.warnings)
     assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
 
 
@@ -235,7 +235,7 @@ def test_an_interrupted_merge_goes_on_where_it_was(rooms, tmp_path, timeless):
         yield tell
 
     outcome = merge(request(out, *rooms, settings=FAST), interrupt)
-    assert [recording.scans for recording in outcome.summary.recordings] == [5, 3, 0]
+    assert [recording.scans for recording in outcome.recordings] == [5, 3, 0]
     assert len(load_run(out / "02_in_room_1").trajectory) == 3  # the results so far are accepted
     seen.clear()
     with pytest.raises(InputError, match=r"was begun with global_map\.max_range_m .* \(now 7\.0\)"):

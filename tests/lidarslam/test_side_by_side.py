@@ -134,7 +134,7 @@ def test_a_node_that_dies_costs_a_merge_only_its_recordings(crossings, tmp_path,
 
     with _two_nodes(doomed) as where:
         outcome = _merge(crossings, out, where)
-    resumed = [warning for warning in outcome.summary.warnings if "the run was resumed once" in warning]
+    resumed = [warning for warning in outcome.warnings if "the run was resumed once" in warning]
     assert len(resumed) == 1
     assert "after 0 scans" not in resumed[0]
     assert timeless(out) == serial_merge
@@ -161,7 +161,7 @@ def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(crossings, tmp
 
     threading.Thread(target=interrupt, daemon=True).start()
     outcome = _merge(crossings, out, Where(2))
-    scans = [recording.scans for recording in outcome.summary.recordings]
+    scans = [recording.scans for recording in outcome.recordings]
     assert any(0 < count < whole for count in scans)
     assert scans[2] == 0
     assert outcome.stopped[-1].endswith("crossing 2: not begun")
