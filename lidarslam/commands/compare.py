@@ -65,8 +65,7 @@ _SECONDS = click.FloatRange(min=0.0)
 @click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.")
 @opt.gate_options(with_method=False)
 @click.option("-o", "--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
-@click.pass_context
-def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
+def evaluate(run: Path | None, **options: Any) -> int:
     """Evaluate a trajectory and its map.
 
     RUN is a run directory, or a trajectory in TUM or KITTI text.  [default: the latest run in runs]
@@ -84,13 +83,13 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
     request = EvaluateRequest(run or opt.latest_run(), needs_reference=not given.pop("no_reference"), **given)
     evaluation = evaluate(request)
     say(format_evaluation(evaluation))
-    if gates:
-        directory = evaluation.estimate.run
-        summary = {} if directory is None else read_summary(directory)
-        judged = judge(gates, {"metrics": evaluation.to_json(), "summary": summary})
-        say(f"\n{format_gates(judged)}")
-        if not all(gate.passed for gate in judged):
-            ctx.exit(EXIT_GATE)
+    if not gates:
+        return 0
+    directory = evaluation.estimate.run
+    summary = {} if directory is None else read_summary(directory)
+    judged = judge(gates, {"metrics": evaluation.to_json(), "summary": summary})
+    say(f"\n{format_gates(judged)}")
+    return 0 if all(gate.passed for gate in judged) else EXIT_GATE
 
 
 @opt.command(
@@ -134,7 +133,7 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
 @click.pass_context
 def compare(
     ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, out: Path | None, **options: Any
-) -> None:
+) -> int:
     """Compare several methods on recordings, in one report.
 
     Each method runs in a process of its own, one after another, or --jobs at a time. A method that crashes or gets
@@ -163,29 +162,25 @@ def compare(
     if out is None:
         name = source_name(sources[0], options["sequence"]) if benchmark is None else benchmark.stem
         out = opt.default_out("compared", name)
-    of_entry = {name: options[name] for name in ("start", "stop", "step", "prior", "reference", "reference_map")}
-    methods = options["methods"] or (DEFAULT_METHODS if benchmark is None else None)
-    of_reader = {"name": options["reader"], "topic": options["topic"], "sequence": options["sequence"]}
+    of_entry = {name: options.pop(name) for name in ("start", "stop", "step", "prior", "reference", "reference_map")}
+    methods = options.pop("methods") or (DEFAULT_METHODS if benchmark is None else None)
+    of_reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     request = CompareRequest(
         out=out,
         recordings=tuple(RecordingEntry(source, **of_entry) for source in sources),
         methods=() if methods is None else parse_methods(methods),
-        config_file=options["config_file"],
-        settings=(*options["settings"], *reader_settings(**of_reader)),
-        limits=Limits(options["memory_limit_mb"], options["timeout_s"]),
+        settings=(*options.pop("settings"), *reader_settings(**of_reader)),
+        limits=Limits(options.pop("memory_limit_mb"), options.pop("timeout_s")),
         where=opt.take_where(options),
-        overwrite=options["overwrite"],
-        reuse=options["reuse"],
         command=command_line("lidarslam", *sys.argv[1:]),
         benchmark=benchmark,
-        data=options["data"],
-        gates=(*options["maxima"], *options["minima"]),
+        gates=(*options.pop("maxima"), *options.pop("minima")),
+        **options,
     )
     outcome = run_compare(request, say, note)
     if outcome.interrupted or outcome.is_empty:
-        ctx.exit(EXIT_MENDABLE)
-    if not outcome.gates_passed:
-        ctx.exit(EXIT_GATE)
+        return EXIT_MENDABLE
+    return 0 if outcome.gates_passed else EXIT_GATE
 
 
 @opt.command("lidarslam demo -o demo")

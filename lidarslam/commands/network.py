@@ -37,8 +37,7 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say
 @opt.jobs_options
 @opt.reader_options
 @opt.config_options
-@click.pass_context
-def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
+def train(sources: tuple[Path, ...], out: Path | None, **options: Any) -> int:
     """Train the learned odometry on recordings without labels.
 
     Ctrl-C ends the training with the weights so far, and --resume continues it. --jobs and --ray are for the
@@ -55,8 +54,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     where = opt.take_where(options)
     from lidarslam.train.train import run_train
 
-    if not run_train(sources, say, out=out, where=where, **options):
-        ctx.exit(EXIT_MENDABLE)
+    return 0 if run_train(sources, say, out=out, where=where, **options) else EXIT_MENDABLE
 
 
 @opt.command("lidarslam export --weights trained/weights.safetensors -o exported")

@@ -76,13 +76,16 @@ class ShippedFile(click.ParamType):  # type: ignore[type-arg]
         return [CompletionItem(incomplete, type="file"), *names]  # in bash a file discards what came before it
 
 
-class _CommandWithExample(click.Command):
-    """Keeps the line breaks of the examples in its help, and takes `-v`."""
+class _Command(click.Command):
+    """Keeps the line breaks of the examples in its help, takes `-v`, and ends with the exit status that is returned."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """The options, with `-v` before `--help`."""
         *own, help_option = super().get_params(ctx)
         return [*own, verbose_option(), help_option]
+
+    def invoke(self, ctx: click.Context) -> None:
+        ctx.exit(super().invoke(ctx) or 0)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         if self.epilog:
@@ -94,7 +97,7 @@ class _CommandWithExample(click.Command):
 
 def command(example: str, name: str | None = None) -> Callable[[Callable[..., Any]], click.Command]:
     """A command with examples of its use, named after the function unless a name is given."""
-    return click.command(name, cls=_CommandWithExample, epilog=example)
+    return click.command(name, cls=_Command, epilog=example)
 
 
 class _Path(click.Path):

@@ -105,8 +105,7 @@ _map_options = opt.together(
 @_OVERWRITE
 @opt.reader_options
 @opt.config_options
-@click.pass_context
-def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -> None:
+def run(source: Path, out: Path | None, **options: Any) -> int:
     """Build trajectory and map of a recording."""
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
@@ -127,21 +126,19 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
             request = RunRequest(source, out, config, given=given, map_formats=map_formats, **options)
             if request.resume and (lost := lost_when_finished(request)) is not None:
                 say(f"{out}: is finished already")
-                ctx.exit(EXIT_LOST if lost else 0)
+                return EXIT_LOST if lost else 0
             page = _page(serve, request.rerun)
             try:
                 outcome = execute(request, progress, progress.phase, page)
             except KeyboardInterrupt:
                 note(abandoned(out))
-                ctx.exit(EXIT_MENDABLE)
+                return EXIT_MENDABLE
         say(format_outcome(out, outcome))
-        if outcome.stopped is None:
-            _keep_serving(page, out)
-    if outcome.stopped is not None:
-        note(format_stop(out, outcome))
-        ctx.exit(EXIT_MENDABLE)
-    if outcome.summary.went_astray:
-        ctx.exit(EXIT_LOST)
+        if outcome.stopped is not None:
+            note(format_stop(out, outcome))
+            return EXIT_MENDABLE
+        _keep_serving(page, out)
+    return EXIT_LOST if outcome.summary.went_astray else 0
 
 
 @opt.command(
@@ -171,8 +168,7 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
 @_REPORT
 @_OVERWRITE
 @opt.config_options
-@click.pass_context
-def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: Any) -> None:
+def live(topic: str | None, out: Path | None, **options: Any) -> int:
     """Build trajectory and map of a robot that is running.
 
     Clouds come over DDS, as ROS 2 sends them; ROS need not be installed. The poses are published on /lidarslam/odometry
@@ -194,13 +190,12 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
                 outcome = execute(request, progress.phase, page)
             except KeyboardInterrupt:
                 note(f"{out}: interrupted, nothing was kept")
-                ctx.exit(EXIT_MENDABLE)
+                return EXIT_MENDABLE
         say(outcome.counts.text())
         say(format_outcome(out, outcome.run))
         if not outcome.is_interrupted:
             _keep_serving(page, out)
-    if outcome.run.summary.went_astray:
-        ctx.exit(EXIT_LOST)
+    return EXIT_LOST if outcome.run.summary.went_astray else 0
 
 
 @opt.command(
@@ -232,16 +227,9 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
 @_OVERWRITE
 @opt.reader_options
 @opt.config_options
-@click.pass_context
 def localise(
-    ctx: click.Context,
-    /,
-    source: Path,
-    map_path: Path,
-    out: Path | None,
-    guess: tuple[float, float, float] | None,
-    **options: Any,
-) -> None:
+    source: Path, map_path: Path, out: Path | None, guess: tuple[float, float, float] | None, **options: Any
+) -> int:
     """Find and track a recording in the map of an earlier run.
 
     The poses in DIR are in the frame of that map, which is not changed. Scans that are not sure to fit are lost, with
@@ -261,16 +249,15 @@ def localise(
             outcome = execute(request, progress, progress.phase, page)
         if outcome.localisation.found_scan is None:
             note(format_not_found(request, outcome))
-            ctx.exit(EXIT_MENDABLE)
+            return EXIT_MENDABLE
         say(format_localisation(request, outcome))
-        if outcome.run.stopped is None:
-            _keep_serving(page)
-    if outcome.run.stopped is not None:
-        note(f"stopped after {outcome.run.summary.scans} scans: {outcome.run.stopped}")
-        ctx.exit(EXIT_MENDABLE)
-    summary = outcome.run.summary
-    if summary.lost_scans or too_many_unreadable(summary.unreadable_scans, summary.scans):
-        ctx.exit(EXIT_LOST)
+        summary, stopped = outcome.run.summary, outcome.run.stopped
+        if stopped is not None:
+            note(f"stopped after {summary.scans} scans: {stopped}")
+            return EXIT_MENDABLE
+        _keep_serving(page)
+    is_lost = summary.lost_scans or too_many_unreadable(summary.unreadable_scans, summary.scans)
+    return EXIT_LOST if is_lost else 0
 
 
 @opt.command(
@@ -287,8 +274,7 @@ def localise(
 @click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
 @opt.reader_options
 @opt.config_options
-@click.pass_context
-def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
+def merge(sources: tuple[Path, ...], out: Path | None, **options: Any) -> int:
     """Build one map of several recordings of a place.
 
     Each recording is tracked, --jobs at a time, and joined to the earlier ones by loop closures. DIR holds the common
@@ -314,9 +300,8 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     for directory in outcome.apart:
         note(f"{directory}: not joined to the others, left out of the common map")
     if outcome.stopped or outcome.apart:
-        ctx.exit(EXIT_MENDABLE)
-    if any(run is not None and run.summary.went_astray for run in outcome.runs):
-        ctx.exit(EXIT_LOST)
+        return EXIT_MENDABLE
+    return EXIT_LOST if any(run is not None and run.summary.went_astray for run in outcome.runs) else 0
 
 
 @contextlib.contextmanager
