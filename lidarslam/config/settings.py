@@ -84,18 +84,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return tree or {}
 
 
-def settings_as_yaml(settings: BaseModel) -> str:
-    """Every setting on a line with its description, every section below its title."""
-    return "\n".join(_section(settings, "")).lstrip("\n") + "\n"
-
-
 def _section(settings: BaseModel, indent: str) -> Iterator[str]:
     values = settings.model_dump(mode="json")
     entries = [(name, field, getattr(settings, name)) for name, field in type(settings).model_fields.items()]
-    plain = {name: f"{indent}{name}: {_flow(values[name])}" for name, _, value in entries if not _is_section(value)}
+    sections = {name for name, _, value in entries if isinstance(value, BaseModel)}
+    plain = {name: f"{indent}{name}: {_flow(values[name])}" for name in values if name not in sections}
     column = min(max(map(len, plain.values()), default=0), _LAST_COLUMN)
     for name, field, value in entries:
-        if _is_section(value):
+        if name in sections:
             if not indent:
                 yield ""
             title = field.description or (type(value).__doc__ or "")
@@ -106,10 +102,6 @@ def _section(settings: BaseModel, indent: str) -> Iterator[str]:
             bounds = bounds_text(field)
             comment = " ".join(filter(None, (field.description, bounds and f"[{bounds}]")))
             yield f"{plain[name]:{column}}  # {comment}" if comment else plain[name]
-
-
-def _is_section(value: Any) -> bool:
-    return isinstance(value, BaseModel)
 
 
 def _flow(value: Any) -> str:
@@ -150,9 +142,11 @@ _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
 _MOST_FAULTS = 5
 # Pydantic's names for numbers beyond their bounds, and for words in the place of a number.
 _BEYOND = ("greater_than_equal", "less_than_equal", "literal_error")
+# Values in messages: their beginning if they are long, as aliases of YAML can make them endless.
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 80
 _SHORT.maxlong = 40
+_short = _SHORT.repr
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -254,11 +248,11 @@ def setting(key: str, text: str) -> str:
 
 
 def dump_yaml(config: BaseModel, described: dict[str, Any] | None = None, section: str = RUN_SECTION) -> str:
-    """The resolved configuration as commented YAML, after a section that describes the run."""
+    """The resolved configuration, after a section that describes the run: each setting with its description."""
+    text = "\n".join(_section(config, "")).lstrip("\n") + "\n"
     if described is None:
-        return settings_as_yaml(config)
-    first = yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)
-    return f"{first}\n{settings_as_yaml(config)}"
+        return text
+    return f"{yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)}\n{text}"
 
 
 def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
@@ -326,18 +320,9 @@ def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, typ
         if key not in section.model_fields:
             return depth, section, field
         field = section.model_fields[key]
-        section = _section_of(field) or BaseModel
+        kinds = (field.annotation, *get_args(field.annotation))
+        section = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), BaseModel)
     return len(location), section, field
-
-
-def _section_of(field: FieldInfo) -> type[BaseModel] | None:
-    kinds = (field.annotation, *get_args(field.annotation))
-    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-
-
-def _short(value: object) -> str:
-    """A value as one would write it, its beginning if it is long: aliases of YAML can make it endless."""
-    return _SHORT.repr(value)
 
 
 CONFIGS = Path(str(files("lidarslam"))) / "configs"
