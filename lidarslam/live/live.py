@@ -26,12 +26,12 @@ from lidarslam.live.messages import CloudDecoder, LiveScan, PosePublisher
 from lidarslam.live.receiving import (
     IMU_DEPTH,
     IMU_WITHIN_S,
-    Arrived,
     ImuReceiver,
     IncomingQueue,
     LiveCounts,
     LiveStatistics,
     PublishedTopic,
+    Received,
     find_topic,
 )
 from lidarslam.mapping.global_map.voxels import TileStore
@@ -114,7 +114,7 @@ class Follower:
         if self._silent == _SILENT:
             logger.warning(_SILENCE)
 
-    def on_arrival(self, message: Arrived) -> None:
+    def on_arrival(self, message: Received) -> None:
         """Count a message."""
         with suppress(ValueError):  # damaged, which is counted when it is decoded
             stamp_ns, _ = read_header(message.raw, ros2=True)
@@ -136,7 +136,7 @@ class Follower:
             if registered == self._request.scans or _is_over(self._request.duration_s, message.arrived_s - begin):
                 return
 
-    def _register(self, message: Arrived) -> bool:
+    def _register(self, message: Received) -> bool:
         """The pose of a message's scan; whether there is one."""
         started = time.perf_counter()
         live = self._decoder.scan(message.raw, message.published_ns)

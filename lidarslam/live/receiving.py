@@ -5,7 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -86,13 +86,7 @@ class Received:
 
     raw: bytes  # CDR, with its four bytes of encapsulation
     published_ns: int  # when it was published, by the publisher's clock
-
-
-@dataclass(frozen=True)
-class Arrived(Received):
-    """A message with its time of arrival."""
-
-    arrived_s: float  # when it arrived, by `time.monotonic`
+    arrived_s: float = field(default_factory=time.monotonic)  # when it arrived, by `time.monotonic`
 
 
 class IncomingQueue:
@@ -106,14 +100,12 @@ class IncomingQueue:
         self,
         receive: Callable[[float], Iterable[Received]],
         longest: int,
-        on_arrival: Callable[[Arrived], None] = lambda _: None,
+        on_arrival: Callable[[Received], None] = lambda _: None,
     ) -> None:
         self.dropped = 0  # messages
         self.is_ended = False  # whether nothing more is received; messages may still be queued
-        self._receive = receive
-        self._on_arrival = on_arrival
-        self._waiting: deque[Arrived] = deque()
-        self._longest = longest
+        self._receive, self._longest, self._on_arrival = receive, longest, on_arrival
+        self._waiting: deque[Received] = deque()
         self._taken_ns = 0  # when the last message that was taken was published
         self._changed = threading.Condition()
         self._error: Exception | None = None
@@ -133,7 +125,7 @@ class IncomingQueue:
             self.is_ended = True
             self._changed.notify_all()
 
-    def take(self, timeout_s: float) -> Arrived | None:
+    def take(self, timeout_s: float) -> Received | None:
         """The oldest message in the queue; None when none arrived in time.
 
         An error of receiving is raised after the messages before it.
@@ -152,12 +144,12 @@ class IncomingQueue:
         try:
             while not self.is_ended:
                 for message in self._receive(_RECEIVE_S):
-                    self._add(Arrived(message.raw, message.published_ns, time.monotonic()))
+                    self._add(message)
         except Exception as error:
             self._error = error
             self.end()
 
-    def _add(self, message: Arrived) -> None:
+    def _add(self, message: Received) -> None:
         self._on_arrival(message)
         with self._changed:
             self._waiting.append(message)
