@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent import futures
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
@@ -125,28 +125,19 @@ class Part(NamedTuple):
     modules: tuple[str, ...]  # that hold its loops, below lidarslam
 
 
-_REGISTRATION = tuple(
-    f"mapping.{name}" for name in ("registration.iteration", "registration.local_map", "tracking.fit")
+# The loops of registration, whatever the map.
+_REGISTRATION = (
+    "mapping.registration.iteration",
+    "mapping.registration.local_map",
+    "mapping.tracking.fit",
+    "mapping.surfels.voxel_hash",
 )
 
 # In the order in which they are compiled: the longest first.
 PARTS = {
-    "surfels": Part(
-        _surfels,
-        (
-            *(f"mapping.surfels.{name}" for name in ("voxel_hash", "surfel_kernels", "surfel_map")),
-            *_REGISTRATION,
-        ),
-    ),
-    "loam": Part(
-        partial(_register, "loam"),
-        (
-            *(f"mapping.loam.{name}" for name in ("features", "feature_map")),
-            *_REGISTRATION,
-            "mapping.surfels.voxel_hash",
-        ),
-    ),
-    "alignment": Part(_alignment, tuple(f"odometry.alignment.{kind}" for kind in ("point_to_plane", "steps"))),
+    "surfels": Part(_surfels, (*_REGISTRATION, "mapping.surfels.surfel_kernels", "mapping.surfels.surfel_map")),
+    "loam": Part(partial(_register, "loam"), (*_REGISTRATION, "mapping.loam.features", "mapping.loam.feature_map")),
+    "alignment": Part(_alignment, ("odometry.alignment.point_to_plane", "odometry.alignment.steps")),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.mounting")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),
@@ -183,7 +174,7 @@ class CompileAhead:
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_closed = False
         self._pool = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="compile")
-        self._done: list[Future[None]] = [self._pool.submit(self._compile, part) for part in uncompiled(parts)]
+        self._done = [self._pool.submit(self._compile, part) for part in uncompiled(parts)]
 
     def __enter__(self) -> Self:
         return self

@@ -1,7 +1,7 @@
 """A scan in the stages of the pipeline: with its odometry, then with its pose."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -19,14 +19,6 @@ STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
 # Larger angular accelerations are errors of the odometry.
 _MOST_RAD_S2 = np.deg2rad(2000.0)
-
-
-class _Turn(NamedTuple):
-    """Mean turn rate (3,) over an interval, rad/s, and its variances (3,)."""
-
-    interval_s: float
-    rate: FloatArray
-    variance: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +45,19 @@ class ScanOdometry:
         before, after = self._turn, None if following is None else following._turn
         if before is None or after is None:
             return None
-        apart_s = 0.5 * (before.interval_s + after.interval_s)
-        acceleration = np.clip((after.rate - before.rate) / apart_s, -_MOST_RAD_S2, _MOST_RAD_S2)
-        signal = np.maximum(acceleration**2 - (before.variance + after.variance) / apart_s**2, 0.0)
+        (before_s, rate_before, variance_before), (after_s, rate_after, variance_after) = before, after
+        apart_s = 0.5 * (before_s + after_s)
+        acceleration = np.clip((rate_after - rate_before) / apart_s, -_MOST_RAD_S2, _MOST_RAD_S2)
+        signal = np.maximum(acceleration**2 - (variance_before + variance_after) / apart_s**2, 0.0)
         return np.asarray(acceleration * signal / np.maximum(acceleration**2, 1e-12), dtype=np.float64)
 
     @property
-    def _turn(self) -> "_Turn | None":
+    def _turn(self) -> tuple[float, FloatArray, FloatArray] | None:
+        """The interval since the previous stamp, the mean turn rate (3,) in it, rad/s, and its variances (3,)."""
         velocity, covariance = self.velocity, self.motion.covariance
         if self.interval_s is None or velocity is None or covariance is None:
             return None
-        return _Turn(self.interval_s, velocity[:3], np.diag(covariance)[:3] / self.interval_s**2)
+        return self.interval_s, velocity[:3], np.diag(covariance)[:3] / self.interval_s**2
 
     def estimated(self, stage_ms: dict[str, float], **values: Any) -> "ScanEstimate":
         """The scan with its pose and quality, and the wall time of a further stage."""

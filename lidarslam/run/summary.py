@@ -36,11 +36,8 @@ _ROW = np.dtype(
     [
         ("stamp", "f8"),
         ("status", "u1"),
-        ("points", "i8"),
-        ("points_dropped", "i8"),
-        ("points_used", "i8"),
-        ("residual_m", "f8"),
-        ("inlier_ratio", "f8"),
+        *((name, "i8") for name in ("points", "points_dropped", "points_used")),
+        *((name, "f8") for name in ("residual_m", "inlier_ratio")),
         ("sigmas", "f8", len(SIGMAS)),
         ("turn_rate", "f8", 3),
         ("odometry_asked", "?"),
@@ -150,11 +147,9 @@ class ScanLog(Stateful):
         return out.getvalue()
 
     def state(self) -> State:
-        """See `Stateful`."""
         return super().state() | {"rows": self.table}
 
     def restore(self, saved: State) -> None:
-        """See `Stateful`."""
         super().restore(saved)
         self._rows = bytearray(saved["rows"].tobytes())
 
@@ -284,6 +279,7 @@ class RunSummary:
     length_m: float
     duration_s: float
     elapsed_s: float
+    elapsed_ms_per_scan: float  # elapsed time of all scans over their number
     ms_per_scan: dict[str, Milliseconds]
     latency_ms: Milliseconds
     realtime_factor: float | None
@@ -302,11 +298,6 @@ class RunSummary:
     elevation: Elevation | None = None
     # ratio of the turn rates within sweeps to those from scan to scan, as of `calibration.time_scale`
     time_scale: float | None = None
-
-    @property
-    def elapsed_ms_per_scan(self) -> float:
-        """Elapsed time of all scans over their number."""
-        return 1e3 * self.elapsed_s / max(1, self.scans)
 
     @property
     def went_astray(self) -> bool:
@@ -369,6 +360,7 @@ def summarise(
         length_m=trajectory.length_m,
         duration_s=trajectory.duration_s,
         elapsed_s=elapsed_s,
+        elapsed_ms_per_scan=1e3 * elapsed_s / max(1, len(log)),
         ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
         latency_ms=Milliseconds.of(stage_ms.sum(axis=1)),
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
