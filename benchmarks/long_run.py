@@ -59,7 +59,7 @@ from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.run import open_odometry
 from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.sensors import Spinning
-from lidarslam.storage.directory import RunDirectory, Unfinished
+from lidarslam.storage.directory import STATE, SUBMAPS, TILES, RunDirectory, Unfinished
 
 _HEADER = (
     "scans", "km", "wall, ms: median", "p99", "keyframes, ms: median", "p99", "CPU, ms per scan", "memory, MB",
@@ -237,13 +237,13 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
         unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
-        graph = begin_graph(config, file=unfinished.files.submaps)
+        graph = begin_graph(config, file=unfinished.run / SUBMAPS)
         assert graph is not None
         stack.callback(graph.close)
         log, odometry = ScanLog(), open_odometry(config, None)
         stack.callback(odometry.close)
         checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
-        store = TileStore(options.out, unfinished.files.tiles)
+        store = TileStore(options.out, unfinished.run / TILES)
         pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
         scans = checkpoints.begin(pipeline, scans, is_recorded=False)
         for row in _rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished):
@@ -283,10 +283,10 @@ def _rows(
             keyframe_p99_ms=float(np.percentile(keyframe_ms, 99.0)),
             cpu_ms=1e3 * (time.process_time() - cpu) / every,
             rss_mb=resident_mb(),
-            state_mb=_size_mb(unfinished.files.state),
+            state_mb=_size_mb(unfinished.run / STATE),
             save_s=checkpoints.save_s,
-            submaps_mb=_size_mb(unfinished.files.submaps),
-            tiles_mb=_size_mb(unfinished.files.tiles),
+            submaps_mb=_size_mb(unfinished.run / SUBMAPS),
+            tiles_mb=_size_mb(unfinished.run / TILES),
             cells=0 if mapper.local_map is None else len(mapper.local_map),
             voxels=0 if pipeline.map.global_map is None else len(pipeline.map.global_map._merged),
             keyframes=len(graph.keyframe_ms),

@@ -46,7 +46,7 @@ from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.world import WORLDS
-from lidarslam.storage.directory import RunDirectory, Unfinished
+from lidarslam.storage.directory import STATE, RunDirectory, Unfinished
 
 _NOISE_M, _ROOM_POINTS, _STILL_POINTS = 0.005, 1_000, 300
 _WITHOUT_ODOMETRY = ["odometry.method=constant-velocity"]
@@ -145,7 +145,7 @@ def watch(case: Case, every: int) -> list[Row]:
         odometry = where_needed(make_odometry(case.config.odometry, case.prior), case.config)
         checkpoints = Checkpoints(unfinished, case.config.checkpoints, odometry, log, None)
         pipeline = Pipeline(odometry, localiser, case.config.global_map, None, checkpoints)
-        mapper, state = localiser.mapper, unfinished.files.state
+        mapper, state = localiser.mapper, unfinished.run / STATE
         statuses, begun, most_mb, started = Counter[Status](), 0, 0.0, time.perf_counter()
         for number, result in enumerate(pipeline.run(prefetch(iter(case.scans))), 1):
             log.add(result)

@@ -47,7 +47,7 @@ from lidarslam.run.results import (
 from lidarslam.run.run import NoScanError, Progress, RunSession, open_odometry, track
 from lidarslam.run.summary import GraphSummary, WrittenMap, graph_and_map_json, peak_rss_mb
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import About, CheckpointFiles, RunDirectory, Unfinished, files_in, remove_run
+from lidarslam.storage.directory import About, RunDirectory, Unfinished, files_in, remove_checkpoint, remove_run
 from lidarslam.storage.finished_run import read_summary
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
@@ -110,7 +110,7 @@ def earlier_parts(out: Path) -> set[str]:
 
 def read_part(run: Path) -> TrackedScans:
     """The scans that the task of a recording left; those of all recordings need not fit into memory."""
-    return decode(TrackedScans, read_state(CheckpointFiles(run).tracked)["part"])  # type: ignore[no-any-return]
+    return decode(TrackedScans, read_state(run / files.TRACKED)["part"])  # type: ignore[no-any-return]
 
 
 # A process whose node was lost may run for some more seconds.
@@ -154,13 +154,12 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
             )
         interruptions = stack.enter_context(Interruptions())
         recording = open_recording(task.request.source, task.request.config.reader)
-        own = CheckpointFiles(out)
-        make_own_folder(own.folder)
-        stack.enter_context(only_writer(own.folder, _PATIENCE_S))
+        make_own_folder(out / files.UNFINISHED)
+        stack.enter_context(only_writer(out / files.UNFINISHED, _PATIENCE_S))
         description = describe_computed(task.request, recording) | task.merge
         is_begun = About.read(out) is not None
         unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out, files_in(out)), description, is_begun))
-        if unfinished.files.tracked.is_file():
+        if (out / files.TRACKED).is_file():
             earlier = read_part(out)
             if not earlier.interrupted:
                 return PartDone(len(earlier.log))
@@ -176,19 +175,20 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
             return PartDone(0, missing, error.interrupted)
         interruptions.protect_results()
         graph.end_recording()
-        write_state(own.tracked, {"part": encode(scans), "graph": graph.state()})
+        write_state(out / files.TRACKED, {"part": encode(scans), "graph": graph.state()})
         if not scans.interrupted:
-            for path in (own.state, own.tiles):  # the state is not resumed any more
-                path.unlink(missing_ok=True)
+            for name in (files.STATE, files.TILES):  # the state is not resumed any more
+                (out / name).unlink(missing_ok=True)
         return PartDone(len(scans.log), interrupted=scans.interrupted)
 
 
 def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:
     """The graph of one recording, new or as it was saved; with loop closures only where they correct the local map."""
     graph: KeyframeGraph | None = None
+    submaps = unfinished.run / files.SUBMAPS
     if config.mapping.method == "surfels" and config.pose_graph.corrects_local_map:
-        graph = begin_graph(config, file=unfinished.files.submaps)
-    graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=unfinished.files.submaps)
+        graph = begin_graph(config, file=submaps)
+    graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=submaps)
     if unfinished.saved is not None:
         graph.restore(unfinished.saved["graph"])
     return graph
@@ -399,7 +399,7 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
                 if run.out.is_symlink():
                     run.out.unlink()
                 if request.overwrite:
-                    CheckpointFiles(run.out).remove()
+                    remove_checkpoint(run.out)
                 own = stack.enter_context(RunDirectory.create(run.out, request.overwrite, request.resume))
                 own.before_change = partial(_replace_earlier, directory, run.out)
                 parts.append(Part(replace(run, config=config), recording, own))
@@ -483,8 +483,8 @@ def _track_all(request: MergeRequest, parts: Sequence[Part], graph: "SlamGraph",
 
 def _add(graph: "SlamGraph", part: Part) -> None:
     """Give the graph the keyframes of a recording; those without any count as well."""
-    own, config = CheckpointFiles(part.request.out), part.request.config.pose_graph.keyframes
-    with closing(KeyframeGraph(config, file=own.submaps if part.scans else None)) as tracked:
+    out, config = part.request.out, part.request.config.pose_graph.keyframes
+    with closing(KeyframeGraph(config, file=out / files.SUBMAPS if part.scans else None)) as tracked:
         if part.scans:
-            tracked.restore(read_state(own.tracked)["graph"])
+            tracked.restore(read_state(out / files.TRACKED)["graph"])
         graph.add_recording(tracked)

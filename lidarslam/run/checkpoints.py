@@ -165,7 +165,7 @@ class Checkpoints:
                 "graph": None if self._graph is None else self._graph.state(),
                 "log": self._log.state(),
             }
-            write_state(self._unfinished.files.state, state)
+            write_state(self._unfinished.run / files.STATE, state)
             logger.info("checkpoint after %s", count(len(self._log), "scan"))
         except (OutputError, OSError) as error:
             logger.info("%s", error)

@@ -52,7 +52,7 @@ from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, reason_of, unless_damaged, write_results
 from lidarslam.run.summary import ScanLog
-from lidarslam.storage.directory import RERUN, UTM, RunDirectory, Unfinished
+from lidarslam.storage.directory import RERUN, STATE, SUBMAPS, TILES, UTM, RunDirectory, Unfinished
 from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer
 
@@ -148,7 +148,7 @@ class RunSession(Generic[R]):
 
     def begin_graph(self, given: GivenLoops | None = None, takes_gnss: bool = False) -> None:
         """Begin the pose graph, where there is one, or resume that of the checkpoint."""
-        file = None if self.unfinished is None else self.unfinished.files.submaps
+        file = None if self.unfinished is None else self.unfinished.run / SUBMAPS
         self.graph = begin_graph(self.request.config, self.directory.path, file, takes_gnss, given)
         if self.graph is not None:
             self.opened.callback(self.graph.close)
@@ -196,7 +196,7 @@ class RunSession(Generic[R]):
         outcome = write_results(
             self.directory, request.config, described, tracked, closed, request.map_formats, self._show_final
         )
-        is_resumable = outcome.stopped is not None and unfinished is not None and unfinished.files.state.is_file()
+        is_resumable = outcome.stopped is not None and unfinished is not None and (unfinished.run / STATE).is_file()
         self.outcome = replace(outcome, is_resumable=is_resumable)
         return self.outcome
 
@@ -303,7 +303,7 @@ def track(
         if start.velocity is not None and isinstance(odometry, ExpectingOdometry):
             odometry.expect(start.velocity)
         localiser = make_localiser(config, inertial, estimator, start.motions)
-    store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
+    store = TileStore(request.out, None if unfinished is None else unfinished.run / TILES)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
         checkpoints.interruptions = session.interruptions

@@ -65,10 +65,14 @@ FILES = (
 # Columns of scans.csv: standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
 SIGMAS = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
 
-# The checkpoint of a run that is running or was stopped, see `lidarslam.storage.directory`.
+# The checkpoint of a run that is running or was stopped: the state after the last scans, the submaps of the graph, the
+# tiles of the global map; a recording of a merge that was tracked.
 UNFINISHED = "unfinished"
 ABOUT = f"{UNFINISHED}/run.json"
 STATE = f"{UNFINISHED}/state.npz"
+SUBMAPS = f"{UNFINISHED}/submaps.bin"
+TILES = f"{UNFINISHED}/tiles.bin"
+TRACKED = f"{UNFINISHED}/tracked.npz"
 
 
 class RunDirectory:
@@ -281,31 +285,24 @@ def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
-class CheckpointFiles:
-    """The files of a run's checkpoint, there or not."""
+def remove_checkpoint(run: Path) -> None:
+    """Remove the checkpoint of a run, there or not, and its folder when it is empty then."""
+    folder = run / UNFINISHED
+    if folder.is_symlink():  # its target is not ours
+        folder.unlink()
+        return
+    (run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are useless
+    _remove_saved_work(run)
+    with contextlib.suppress(OSError):  # another file is there
+        folder.rmdir()
 
-    def __init__(self, run: Path) -> None:
-        self.run, self.folder = run, run / UNFINISHED
-        self.state = run / STATE  # after the last scans
-        self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"  # of graph and global map
-        self.tracked = self.folder / "tracked.npz"  # a recording of a merge that was tracked
 
-    def remove(self) -> None:
-        """Remove them, and their folder when it is empty then."""
-        if self.folder.is_symlink():  # its target is not ours
-            self.folder.unlink()
-            return
-        (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are useless
-        self.clear()
-        with contextlib.suppress(OSError):  # another file is there
-            self.folder.rmdir()
-
-    def clear(self) -> None:
-        """Remove the saved work; the folder still names the unfinished run."""
-        if self.folder.is_dir():
-            remove_partial_files(self.folder)
-        for path in (self.state, self.submaps, self.tiles, self.tracked):
-            path.unlink(missing_ok=True)
+def _remove_saved_work(run: Path) -> None:
+    """The folder still names the unfinished run."""
+    if (run / UNFINISHED).is_dir():
+        remove_partial_files(run / UNFINISHED)
+    for name in (STATE, SUBMAPS, TILES, TRACKED):
+        (run / name).unlink(missing_ok=True)
 
 
 def remove_run(run: Path) -> None:
@@ -314,7 +311,7 @@ def remove_run(run: Path) -> None:
         remove_partial_files(run)
         if (run / ABOUT).exists() or config_begins_with(run, RUN_SECTION):
             remove_files(run)
-            CheckpointFiles(run).remove()
+            remove_checkpoint(run)
     if not any(run.iterdir()):
         run.rmdir()
 
@@ -324,7 +321,6 @@ class Unfinished:
 
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
-        self.files = CheckpointFiles(run)
         self.saved: State | None = None  # the state to resume from, None to begin
         self._keeps_earlier = False  # whether the whole results of an earlier run are there
 
@@ -344,28 +340,28 @@ class Unfinished:
             _require_same(run, begun.description, description)
             about = begun
         unfinished = cls(run, about, resume)
-        make_own_folder(unfinished.files.folder)
-        for folder in (run, unfinished.files.folder):
+        make_own_folder(run / UNFINISHED)
+        for folder in (run, run / UNFINISHED):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()
         unfinished._keeps_earlier = directory.has_earlier and _holds_results(run)
         if not resume:
-            unfinished.files.clear()
-        elif unfinished.files.state.is_file():
-            unfinished.saved = read_state(unfinished.files.state)
+            _remove_saved_work(run)
+        elif (run / STATE).is_file():
+            unfinished.saved = read_state(run / STATE)
         directory.before_change = unfinished.replace_earlier
         try:
             yield unfinished
         except BaseException:
             is_mixed = directory._written and directory.has_earlier
             if not (was_there or unfinished.is_resumable or is_mixed):
-                unfinished.files.remove()
+                remove_checkpoint(run)
             raise
 
     @property
     def is_resumable(self) -> bool:
         """Whether there is saved work: its own, or of the parts of a merge."""
-        return self.files.state.is_file() or self.files.tracked.is_file() or any(self.run.glob(f"*/{ABOUT}"))
+        return any((self.run / name).is_file() for name in (STATE, TRACKED)) or any(self.run.glob(f"*/{ABOUT}"))
 
     def begin(self, scans: int) -> None:
         """Mark the directory as one with a running run; `scans` are done already where it resumes."""
@@ -385,7 +381,7 @@ class Unfinished:
         if stopped:
             replace(self.about, standing="stopped").write(self.run)
         else:
-            self.files.remove()
+            remove_checkpoint(self.run)
 
 
 def _holds_results(run: Path) -> bool:

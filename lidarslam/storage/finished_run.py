@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.scan import PointAttributes
@@ -237,10 +238,8 @@ def read_summary(path: Path) -> dict[str, Any]:
     file = path / files.SUMMARY
     if not file.is_file():
         return {}
-    try:
+    with reading(file, "not a run's summary", "make the run again"):
         return read_json(file, ANY_OBJECT)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: not a run's summary ({error}); make the run again") from error
 
 
 # Each recording's folder holds its own comparison.json, where there are several.

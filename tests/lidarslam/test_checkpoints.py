@@ -22,7 +22,7 @@ from lidarslam.run import checkpoints
 from lidarslam.run.checkpoints import Checkpoints, scans_left
 from lidarslam.run.results import TileWriter
 from lidarslam.run.summary import ScanLog
-from lidarslam.storage.directory import CONFIG, MAP_PLY, METRICS, RunDirectory, Unfinished, require_whole
+from lidarslam.storage.directory import CONFIG, MAP_PLY, METRICS, STATE, RunDirectory, Unfinished, require_whole
 
 
 @dataclass
@@ -63,7 +63,7 @@ def test_saving_takes_two_percent_of_the_time_at_most(unfinished, monkeypatch, c
     pipeline.now += 0.02
     assert kept.is_due()
     kept.save(cast(Pipeline, pipeline))
-    assert read_state(unfinished.files.state)["log"]["messages"] == []
+    assert read_state(unfinished.run / STATE)["log"]["messages"] == []
     pipeline.now += pause_s - 0.01
     assert not kept.is_due()
     pipeline.now += 0.02
