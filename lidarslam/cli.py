@@ -111,14 +111,13 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-_COMMANDS = (
+for _command in (
     *(demo, datasets, info, simulate),
     *(run, live, localise, merge),
     *(train, export),
     *(evaluate, view, compare, config),
     *(edit, export_bag, export_grid, export_mesh, export_geo),
-)
-for _command in _COMMANDS:
+):
     main.add_command(_command)
 
 

@@ -1,6 +1,6 @@
 """Localisation of a recording in a finished map: from a source and a map to a run directory in the map's frame."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -184,19 +184,18 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
 
 def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
     """A localisation in a few lines: where it was found, tracked and lost scans, and where the files are."""
-    return joined(_lines(request, outcome))
-
-
-def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     summary, found, out = outcome.run.summary, outcome.localisation, request.run.out
-    yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     confirmed = f"confirmed at scan {found.confirmed_scan}, after {found.confirmed_after_s:.1f} s"
-    yield f"found at scan {found.found_scan}, {confirmed}"
     before = f", {found.placed_afterwards:,} before that placed afterwards" if found.placed_afterwards else ""
-    yield f"{found.tracked_scans:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
-    yield from format_times(summary)
-    yield from format_end(out, summary)
-    yield f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}"
+    lines = [
+        f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s",
+        f"found at scan {found.found_scan}, {confirmed}",
+        f"{found.tracked_scans:,} scans tracked in the map{before}, {summary.lost_scans:,} lost",
+        *format_times(summary),
+        *format_end(out, summary),
+        f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}",
+    ]
+    return joined(lines)
 
 
 def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:

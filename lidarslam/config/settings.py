@@ -181,6 +181,10 @@ class Config(Settings):
     viewer: ViewerConfig = ViewerConfig()
     checkpoints: CheckpointConfig = CheckpointConfig()
 
+    def having(self, section: str, **settings: Any) -> "Config":
+        """The configuration with other settings of a section, whose values are not checked."""
+        return self.model_copy(update={section: getattr(self, section).model_copy(update=settings)})
+
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """The defaults, changed by a YAML file and then by settings such as `odometry.kiss_icp.voxel_size_m=0.5`.

@@ -30,15 +30,9 @@ from lidarslam.live.receiving import PublishedTopic, Received
 _CONFIG = "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max='32MB'/></Internal></Domain></CycloneDDS>"
 _MOST_ENDPOINTS = 10_000
 _DEPTH = 10  # messages that are queued in a reader or for a slow subscriber
-_BASE_TYPES = {
-    "bool": bool,
-    "string": str,
-    "byte": types.uint8,
-    "octet": types.uint8,
-    "char": types.uint8,
-    **{name: getattr(types, name) for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32")},
-    **{name: getattr(types, name) for name in ("int64", "uint64", "float32", "float64")},
-}
+_NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+_BASE_TYPES = {"bool": bool, "string": str, **dict.fromkeys(("byte", "octet", "char"), types.uint8)}
+_BASE_TYPES |= {name: getattr(types, name) for name in _NUMBERS}
 
 
 class DdsNode:

@@ -115,7 +115,6 @@ class Follower:
             logger.warning(_SILENCE)
 
     def on_arrival(self, message: Received) -> None:
-        """Count a message."""
         with suppress(ValueError):  # damaged, which is counted when it is decoded
             stamp_ns, _ = read_header(message.raw, ros2=True)
             self._statistics.arrived((stamp_ns or message.published_ns) / 10**9, message.arrived_s)
@@ -265,9 +264,8 @@ def bounded(config: Config) -> Config:
     A scan's mapping has a budget, which follows the rate of the sensor unless one is given. The local map is not
     corrected: tracking would wait for the pose graph to rebuild it.
     """
-    mapping = config.mapping.model_copy(update={"budget_ms": config.mapping.budget_ms or "auto"})
-    graph = config.pose_graph.model_copy(update={"corrects_local_map": False})
-    return config.model_copy(update={"mapping": mapping, "pose_graph": graph})
+    config = config.having("mapping", budget_ms=config.mapping.budget_ms or "auto")
+    return config.having("pose_graph", corrects_local_map=False)
 
 
 def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> ImuReceiver | None:

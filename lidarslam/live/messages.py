@@ -189,7 +189,6 @@ class PosePublisher:
         self._T_body_lidar = T_body_lidar
 
     def publish(self, stamp_ns: int, estimate: ScanEstimate) -> None:
-        """Publish the pose of a scan."""
         if estimate.status is Status.LOST:
             return
         # With A the adjoint of T_body_lidar, an error or velocity xi of the LiDAR is A xi of the body.

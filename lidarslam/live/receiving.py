@@ -277,12 +277,10 @@ class LiveStatistics:
         self._from_stamp: list[float] = []
 
     def arrived(self, stamp_s: float, arrived_s: float) -> None:
-        """Count a message that has arrived."""
         with self._lock:
             self._arrived.append((stamp_s, arrived_s))
 
     def registered(self, stamp_s: float, arrived_s: float) -> None:
-        """Count a scan whose pose is published."""
         since_arrival_s, since_stamp_s = time.monotonic() - arrived_s, time.time() - stamp_s
         with self._lock:
             self._from_arrival.append(since_arrival_s)

@@ -226,7 +226,6 @@ class MergeOutcome:
 
     @property
     def lost_scans(self) -> int:
-        """Number of lost scans of all recordings."""
         return sum(recording.lost_scans for recording in self.recordings)
 
     @property
@@ -252,7 +251,6 @@ class Part:
 
     @property
     def scans(self) -> int:
-        """Number of scans that were tracked."""
         return 0 if self.done is None else self.done.scans
 
 
@@ -382,8 +380,7 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
         raise ConfigError(
             "odometry.method is external: one trajectory is not that of several recordings; choose another"
         )
-    pose_graph = request.config.pose_graph.model_copy(update={"enabled": True})
-    request = replace(request, config=request.config.model_copy(update={"pose_graph": pose_graph}))
+    request = replace(request, config=request.config.having("pose_graph", enabled=True))
     runs, earlier = open_parts(request), earlier_parts(request.out)
     names = {run.out.name for run, _ in runs}
     config = _on_common_voxels(request.config, [recording for _, recording in runs])
@@ -442,8 +439,7 @@ def _on_common_voxels(config: Config, recordings: Sequence[Recording]) -> Config
         with suppress(InputError):  # its scans up to where it is damaged
             for scan in take_in(recording, range(len(recording)), Faults()):
                 if len(scan):
-                    global_map = config.global_map.model_copy(update={"voxel_size_m": voxel_size_for(scan.points)})
-                    return config.model_copy(update={"global_map": global_map})
+                    return config.having("global_map", voxel_size_m=voxel_size_for(scan.points))
     return config
 
 

@@ -67,7 +67,6 @@ class OdometryGate(Stateful):
         return Motion(np.eye(4), 0, "not needed", is_asked=False)
 
     def expect(self, velocity: FloatArray) -> None:
-        """See `ExpectingOdometry`."""
         if isinstance(self._odometry, ExpectingOdometry):
             self._odometry.expect(velocity)
 
@@ -89,7 +88,6 @@ class OdometryGate(Stateful):
         return super().state()
 
     def close(self) -> None:
-        """Close the odometry."""
         self._odometry.close()
 
     def _may_be_skipped(self) -> bool:

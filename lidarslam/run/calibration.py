@@ -268,9 +268,8 @@ def with_elevations(
     angle_deg, _ = elevation_of(recording)
     if found is not None and found.warning is not None:
         angle_deg = round(found.elevation_bias_deg, 3)
-    reader = request.config.reader.model_copy(update={"elevation_correction_deg": angle_deg})
-    request = replace(request, config=request.config.model_copy(update={"reader": reader}))
-    return request, open_recording(request.source, reader)
+    config = request.config.having("reader", elevation_correction_deg=angle_deg)
+    return replace(request, config=config), open_recording(request.source, config.reader)
 
 
 # Slower turns, rad/s, and fewer scans decide nothing; between scans farther apart, a shaken sensor turns differently.

@@ -144,7 +144,6 @@ class Checkpoints:
         self._cost_s: float | None = None  # of the last one
 
     def is_due(self) -> bool:
-        """Whether a checkpoint is due."""
         self._scans += 1
         self.interruptions.takes_requests = True  # before the first scan there is nothing to save
         if self.interruptions.is_requested:

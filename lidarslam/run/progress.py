@@ -67,7 +67,6 @@ class RunProgress:
             print(line, file=sys.stderr, flush=True)
 
     def phase(self, words: str) -> None:
-        """Show the current step."""
         self._bar.update(self._task, state=words)
 
 

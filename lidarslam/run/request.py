@@ -117,6 +117,5 @@ def written_request(run: Path, asked: Config) -> tuple[dict[str, Any], Config]:
     tree = read_yaml(run / CONFIG)
     described, config = tree.pop(RUN_SECTION), Config.model_validate(tree)
     if asked.reader.elevation_correction_deg == "auto":
-        reader = config.reader.model_copy(update={"elevation_correction_deg": "auto"})
-        config = config.model_copy(update={"reader": reader})
+        config = config.having("reader", elevation_correction_deg="auto")
     return described, config

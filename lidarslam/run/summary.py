@@ -306,7 +306,6 @@ class RunSummary:
 
     @property
     def lost_scans(self) -> int:
-        """Number of lost scans."""
         return sum(stretch.last - stretch.first + 1 for stretch in self.lost)
 
     def to_json(self) -> dict[str, Any]:
