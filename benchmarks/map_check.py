@@ -61,7 +61,7 @@ def run(source: Path, out: Path, settings: dict[str, object], prior: Path | None
 
 
 def row(name: str, distortion: str, summary: RunSummary) -> str:
-    found = summary.contradictions
+    found = summary.map_contradictions
     clearest = max(found, key=lambda one: one.votes - one.votes_at_pose, default=None)
     what = "none" if clearest is None else f"{clearest.shift_m:+.1f} m, {sum(one.pairs for one in found)} pairs"
     votes = "" if clearest is None else f"{clearest.votes_at_pose:.0f} of {clearest.votes:.0f}"

@@ -289,7 +289,7 @@ def format_times(summary: RunSummary) -> Iterator[str]:
     """Lines about elapsed time and memory, and about the latency of one scan."""
     elapsed = f"{summary.elapsed_s:.1f} s for all scans, {summary.elapsed_ms_per_scan:.1f} ms per scan"
     yield f"{elapsed}{_speed(summary.realtime_factor)}; {summary.peak_rss_mb:,.0f} MB of memory"
-    latency, slowest = summary.latency_ms, summary.slowest
+    latency, slowest = summary.latency_ms, summary.slowest_scan
     worst = "" if slowest is None else f"; slowest: scan {slowest.scan:,}, {slowest.ms:.0f} ms of {slowest.stage}"
     yield f"latency of one scan: median {latency.median:.0f} ms, 99 % under {latency.p99:.0f} ms{worst}"
 

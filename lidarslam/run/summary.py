@@ -267,9 +267,9 @@ class GraphSummary:
         return asdict(self) | {"loops": [loop.to_json() for loop in self.loops]}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """The content of summary.json.
+    """The content of summary.json, in its order and by its keys, but for those of `graph_and_map_json`.
 
     `ms_per_scan["total"]` is the time from one finished scan to the next, and `latency_ms` the sum of a scan's stages,
     which is more, as the stages of successive scans overlap.
@@ -280,54 +280,38 @@ class RunSummary:
     duration_s: float
     elapsed_s: float
     elapsed_ms_per_scan: float  # elapsed time of all scans over their number
-    ms_per_scan: dict[str, Milliseconds]
-    latency_ms: Milliseconds
     realtime_factor: float | None
     peak_rss_mb: float
-    lost: tuple[LostStretch, ...]
+    lost_scans: int
     degraded_scans: int
     # distance travelled along axes of the sensor that the scans did not, or hardly, constrain: it is a prediction
     unconstrained_m: float
     odometry_asked: int  # number of scans
     unreadable_scans: int  # number of scans that were asked for and are damaged or missing
+    latency_ms: Milliseconds
+    ms_per_scan: dict[str, Milliseconds]
+    slowest_scan: SlowestScan | None
+    lost: tuple[LostStretch, ...]
+    map_contradictions: tuple[Contradiction, ...]
+    # as of `calibration.Elevation`
+    elevation_bias_deg: float | None = None
+    elevation_sigma_deg: float | None = None
+    elevation_correction_deg: float | None = None
+    # ratio of the turn rates within sweeps to those from scan to scan, as of `calibration.time_scale`
+    time_scale: float | None
     graph: GraphSummary | None
     map: WrittenMap
     warnings: tuple[str, ...]
-    contradictions: tuple[Contradiction, ...] = ()
-    slowest: SlowestScan | None = None
-    elevation: Elevation | None = None
-    # ratio of the turn rates within sweeps to those from scan to scan, as of `calibration.time_scale`
-    time_scale: float | None = None
 
     @property
     def went_astray(self) -> bool:
         """Whether the exit status is 3."""
         return where_astray(self.to_json()) is not None
 
-    @property
-    def lost_scans(self) -> int:
-        return sum(stretch.last - stretch.first + 1 for stretch in self.lost)
-
     def to_json(self) -> dict[str, Any]:
         """The content of summary.json."""
-        elevation = dict.fromkeys(Elevation.__dataclass_fields__) if self.elevation is None else asdict(self.elevation)
-        return {
-            **{name: getattr(self, name) for name in _NUMBERS},
-            "latency_ms": vars(self.latency_ms),
-            "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
-            "slowest_scan": None if self.slowest is None else vars(self.slowest),
-            "lost": [vars(stretch) for stretch in self.lost],
-            "map_contradictions": [vars(found) for found in self.contradictions],
-            **elevation,
-            "time_scale": self.time_scale,
-            **graph_and_map_json(self.graph, self.map, self.warnings),
-        }
-
-
-_NUMBERS = (
-    *("scans", "length_m", "duration_s", "elapsed_s", "elapsed_ms_per_scan", "realtime_factor", "peak_rss_mb"),
-    *("lost_scans", "degraded_scans", "unconstrained_m", "odometry_asked", "unreadable_scans"),
-)
+        own = {name: value for name, value in asdict(self).items() if name not in ("graph", "map", "warnings")}
+        return own | graph_and_map_json(self.graph, self.map, self.warnings)
 
 
 def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings: Sequence[str]) -> dict[str, Any]:
@@ -360,22 +344,23 @@ def summarise(
         duration_s=trajectory.duration_s,
         elapsed_s=elapsed_s,
         elapsed_ms_per_scan=1e3 * elapsed_s / max(1, len(log)),
-        ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
-        latency_ms=Milliseconds.of(stage_ms.sum(axis=1)),
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
         peak_rss_mb=peak_rss_mb(),
-        lost=tuple(_lost_stretches(log)),
+        lost_scans=log.statuses.count(Status.LOST),
         degraded_scans=log.statuses.count(Status.DEGRADED),
         unconstrained_m=unconstrained_m,
         odometry_asked=int(log.table["odometry_asked"].sum()),
         unreadable_scans=unreadable,
+        latency_ms=Milliseconds.of(stage_ms.sum(axis=1)),
+        ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
+        slowest_scan=SlowestScan.of(stage_ms),
+        lost=tuple(_lost_stretches(log)),
+        map_contradictions=contradictions,
+        **({} if elevation is None else asdict(elevation)),
+        time_scale=None if scale is None else scale[0],
         graph=graph,
         map=written,
         warnings=(*log.warnings, *_warnings(log, unreadable, contradictions, written, unconstrained_m, scale)),
-        contradictions=contradictions,
-        slowest=SlowestScan.of(stage_ms),
-        elevation=elevation,
-        time_scale=None if scale is None else scale[0],
     )
 
 
