@@ -37,15 +37,7 @@ from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
-from lidarslam.run.calibration import (
-    Elevation,
-    found_imu,
-    imu_samples,
-    open_inertial,
-    prior_warning,
-    unused_imu,
-    with_elevations,
-)
+from lidarslam.run import calibration
 from lidarslam.run.checkpoints import Checkpoints, describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
@@ -90,7 +82,7 @@ def execute(
     recording, chosen = request.open()
     _require_given(request.given, len(chosen))
     log_choices(request, chosen, len(recording))
-    imu_samples(request.config, recording)
+    calibration.imu_samples(request.config, recording)
     gnss = gnss_track(request)
     with open_session(request, phase, recording) as session:
         if request.resumable:
@@ -101,7 +93,7 @@ def execute(
             session.log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
         session.show(recording.name, page)
         session.wait_for_loops()
-        session.request, recording = with_elevations(request, recording, chosen, phase)
+        session.request, recording = calibration.with_elevations(request, recording, chosen, phase)
         phase("reading the first scans")
         tracked = track(session, recording, chosen, progress, session.graph)
         session.end_scans()
@@ -291,7 +283,7 @@ def track(
     request, log, odometry, unfinished = session.request, session.log, session.odometry, session.unfinished
     config, faults, estimator = request.config, Faults(), ElevationEstimator()
     scans = take_in(recording, chosen, faults)
-    inertial = open_inertial(config, recording, chosen, log.warn)
+    inertial = calibration.open_inertial(config, recording, chosen, log.warn)
     if inertial is not None:
         scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
@@ -317,15 +309,15 @@ def track(
             raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
-    elevation = Elevation.found(recording, estimator)
+    elevation = calibration.Elevation.found(recording, estimator)
     if inertial is not None:
-        log.warn(*inertial.warnings, found_imu(inertial, recording))
+        log.warn(*inertial.warnings, calibration.found_imu(inertial, recording))
     if isinstance(odometry, ExternalOdometry):
-        log.warn(odometry.warning, prior_warning(log.odometry, log.trajectory))
+        log.warn(odometry.warning, calibration.prior_warning(log.odometry, log.trajectory))
     log.warn(None if elevation is None else elevation.warning)
     if any(status is not Status.OK for status in log.statuses):
         with suppress(InputError):  # of damaged samples
-            log.warn(unused_imu(config, recording))
+            log.warn(calibration.unused_imu(config, recording))
     tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 
