@@ -143,20 +143,20 @@ class _Poses:
         self._scans = _registered(config, recording, chosen)
         self._poses: list[tuple[float, FloatArray, bool]] = []
 
+    def __iter__(self) -> Iterator[tuple[float, FloatArray, bool]]:
+        yield from self._poses
+        for scan, mapped in self._scans:
+            self._poses.append((scan.stamp, mapped.state.T_world_lidar, mapped.registered and mapped.is_connected))
+            yield self._poses[-1]
+
     def compared(self, samples: ImuSamples, T_lidar_imu: FloatArray, most: int) -> "Iterator[Comparison]":
         """The comparison with an IMU after every ten of at most `most` scans, and after the last."""
         from lidarslam.mapping.inertial.comparison import Comparison
 
         comparison = Comparison(samples, T_lidar_imu)
-        for number in range(most):
-            if number == len(self._poses):
-                for scan, mapped in islice(self._scans, 1):
-                    follows = mapped.registered and mapped.is_connected
-                    self._poses.append((scan.stamp, mapped.state.T_world_lidar, follows))
-            if number == len(self._poses):
-                break
-            comparison.add(*self._poses[number])
-            if (number + 1) % _EVERY == 0:
+        for number, pose in enumerate(islice(self, most), start=1):
+            comparison.add(*pose)
+            if number % _EVERY == 0:
                 yield comparison
         yield comparison
 

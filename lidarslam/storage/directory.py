@@ -269,7 +269,7 @@ def _warn_of_earlier(run: Path) -> None:
 
 def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
     old, new = flat(was), flat(asked)
-    names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
+    names = [name for name in old | new if old.get(name) != new.get(name)]
     if names:
         changes = first_few([f"{name} {old.get(name)} (now {new.get(name)})" for name in names], 3)
         raise InputError(
