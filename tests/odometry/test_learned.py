@@ -107,19 +107,12 @@ def test_a_bad_guess_gives_way_to_the_last_motion_over_the_time_that_went_by(box
 
 def test_the_first_motion_follows_on_the_expected_velocity_unless_scans_refute_that(box_room, monkeypatch):
     monkeypatch.setattr(search, "STEPS_M", ())
-    scans, far_off = box_room.scans(3, TWIST), exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0))
-
-    def expecting(velocity: tuple[float, ...], guess: FloatArray) -> list[Motion]:
-        odometry = LearnedOdometry(Told(guess, moved()), IMAGES)
-        odometry.expect(np.array(velocity))
-        return [odometry.estimate(scan) for scan in scans]
-
-    for guess in (far_off, moved()):
-        for motion in expecting(TWIST, guess)[1:]:
+    scans, told = box_room.scans(3, TWIST), moved()
+    for velocity, guess in [(TWIST, exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0))), (TWIST, told), ((0, 0, 15, 20, 0, 0), told)]:
+        odometry = LearnedOdometry(Told(guess, told), IMAGES)
+        odometry.expect(np.array(velocity, dtype=np.float64))
+        for motion in [odometry.estimate(scan) for scan in scans][1:]:
             assert_close(motion, moved())
-    wrong = expecting((0.0, 0.0, 15.0, 20.0, 0.0, 0.0), moved())
-    for motion, told in zip(wrong, estimates(scans, Told(moved())), strict=True):
-        assert np.array_equal(motion.T_prev_curr, told.T_prev_curr)
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
