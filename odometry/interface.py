@@ -64,10 +64,10 @@ class SkippingOdometry(Odometry, Protocol):
 
 @runtime_checkable
 class ExpectingOdometry(Protocol):
-    """An odometry that chooses among motions, of which one may be known otherwise."""
+    """An odometry that chooses among motions by the velocity before, which may be known at the first one."""
 
     def expect(self, velocity: FloatArray) -> None:
-        """Take the velocity (6,) of the first motion, rotation first, as another candidate, before the first scan."""
+        """Take the velocity (6,) before the first motion, rotation first, before the first scan."""
 
 
 class StatefulOdometry(Stateful):

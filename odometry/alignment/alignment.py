@@ -78,7 +78,7 @@ class InitialEstimate:
     information: FloatArray | None = None
     # (6, 6) that holds the change of velocity at the expected one; None: the usual one
     change_information: FloatArray | None = None
-    sigmas: float = 0.0  # by which it is less likely than the first initial estimate, in standard deviations
+    sigmas: float = 0.0  # standard deviations by which it is less likely than the likeliest one could be
 
 
 @dataclass(frozen=True, eq=False)

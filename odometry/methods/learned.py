@@ -17,6 +17,7 @@ from lidarslam.core.state import Shape
 from lidarslam.odometry.alignment.alignment import (
     DOUBTFUL,
     INFORMATION_PER_M2,
+    Alignment,
     InitialEstimate,
     align,
     align_best,
@@ -144,17 +145,9 @@ class LearnedOdometry(StatefulOdometry):
     def _refined(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep) -> Motion:
         """The candidates, or the motion before, refined by alignment."""
         interval_s = sweep.middle - last.middle
-        previous, expected = self._interpolator.last, self._expected
-        self._expected = None
+        previous = self._interpolator.last
         sweeps = SweepPair(sweep.images.alignment, last.images.alignment, interval_s, previous)
-        if previous is None and expected is not None:
-            before = np.kron(np.eye(2), sweep.images.R_image_lidar) @ expected
-            sweeps = replace(sweeps, last=SweepMotion(before, np.zeros(6), interval_s))
-        best = align_best(_initial_estimates(candidates, sweeps), sweeps)
-        if previous is None and expected is not None and best.explained < DOUBTFUL:
-            without = replace(sweeps, last=None)
-            other = align_best(_initial_estimates(candidates, without), without)
-            best, sweeps = (best, sweeps) if best.explained > other.explained else (other, without)
+        best, sweeps = self._best(candidates, sweeps, sweep.images.R_image_lidar)
         degeneracy = find_degeneracy(best.information, best.inliers, sweep.images.alignment)
         if len(degeneracy):
             covariance = candidates[0].covariance
@@ -176,6 +169,21 @@ class LearnedOdometry(StatefulOdometry):
         motion = self._motion(best.T_prev_curr, covariance, best.velocity_change, last, sweep, best.inliers)
         return replace(motion, degenerate=degeneracy.names)
 
+    def _best(
+        self, candidates: Sequence[Candidate], sweeps: SweepPair, R_image_lidar: FloatArray
+    ) -> tuple[Alignment, SweepPair]:
+        """The best alignment, and the sweeps with the motion before: at the first pair the expected one, if it fits."""
+        expected, self._expected = self._expected, None
+        if expected is None or sweeps.last is not None:
+            return align_best(_initial_estimates(candidates, sweeps), sweeps), sweeps
+        before = SweepMotion(np.kron(np.eye(2), R_image_lidar) @ expected, np.zeros(6), sweeps.interval_s)
+        begun = replace(sweeps, last=before)
+        best = align_best(_initial_estimates(candidates, begun), begun)
+        if best.explained >= DOUBTFUL:
+            return best, begun
+        other = align_best(_initial_estimates(candidates, sweeps), sweeps)
+        return (best, begun) if best.explained > other.explained else (other, sweeps)
+
     def _motion(
         self, T_prev_curr: FloatArray, covariance: FloatArray, change: FloatArray, last: _Sweep, sweep: _Sweep,
         points_used: int,
@@ -194,7 +202,7 @@ class LearnedOdometry(StatefulOdometry):
 
 
 def _initial_estimates(candidates: Sequence[Candidate], sweeps: SweepPair) -> list[InitialEstimate]:
-    """The candidates, less likely by their scores and by the change of a known motion before, and that continued."""
+    """The candidates, less likely by their scores and by the acceleration to them, and the motion before, continued."""
     squared = [2.0 * max(0.0, candidates[0].log_probability - one.log_probability) for one in candidates]
     continued: list[InitialEstimate] = []
     if sweeps.last is not None:
