@@ -123,10 +123,10 @@ def smoothed_start(scans: Iterable[Scan], config: MappingConfig, inertial: "Iner
         needed |= not ordered.has_rings or mapped.status is not Status.OK
         if len(taken) == TRIED:
             chosen = _likeliest(taken, ordered, unlimited, inertial)
-            is_other = chosen is not ordered  # the likeliest of several velocities
-            if is_other:
+            is_found = chosen is not ordered and inertial is None  # with an IMU, velocities on a coarse grid are tried
+            if chosen is not ordered:
                 ordered, needed, least = chosen, True, np.inf if inertial is None else _LEAST_CONSTRAINT
-            if is_other or all(one.status is Status.OK for one in ordered.results[1:]):
+            if is_found or all(one.status is Status.OK for one in ordered.results[1:]):
                 velocity = body_velocity(_motions(ordered.results[1:3])[0], taken[2].stamp - taken[1].stamp)
             if ordered.is_at_rest:
                 return SmoothedStart(velocity=velocity)
