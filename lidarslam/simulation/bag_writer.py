@@ -14,6 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from lidarslam.core.errors import OutputError
+from lidarslam.core.imu import ImuSamples
 from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_ns
@@ -103,8 +104,8 @@ def write_bag(
     else:
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         bag = Rosbag2Writer(folder, version=_ROSBAG2_VERSION, storage_plugin=plugin)
-    serializer = MessageSerializer(ros2=kind != "rosbag1")
-    messages = (_clouds(bag, serializer, scans, rig), _imu(bag, serializer, rig))
+    topics = _Topics(bag, DRIVERS[rig.driver], ros2=kind != "rosbag1")
+    messages = (topics.clouds(scans, rig.sweep_s), topics.imu(rig.imu))
     try:
         with bag:
             for message in heapq.merge(*messages, key=lambda message: message[1]):
@@ -116,74 +117,62 @@ def write_bag(
 Messages = Iterator[tuple[Any, int, bytes]]  # connection, time of recording in nanoseconds, bytes; in order of time
 
 
-def _clouds(
-    bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", scans: Iterable[SimulatedScan], rig: Rig
-) -> Messages:
-    driver = DRIVERS[rig.driver]
-    connection = bag.add_connection(driver.topic, driver.message_type, typestore=serializer.store)
-    # A message is published, and recorded, when its last point has been measured.
-    latency_ns = round(1e9 * rig.sweep_s)
-    for number, simulated in enumerate(scans):
-        stamp_ns = clock_ns(simulated.scan.stamp)
-        records = driver.records(simulated, stamp_ns)
-        yield connection, stamp_ns + latency_ns, serializer.serialize(driver, records, stamp_ns, number)
+class _Topics:
+    """The messages of a driver for a bag, serialised for ROS 1 (packed) or ROS 2 (CDR)."""
 
+    def __init__(self, bag: Rosbag1Writer | Rosbag2Writer, driver: DriverCloud, ros2: bool) -> None:
+        self._bag, self._driver, self._ros2, self._store = bag, driver, ros2, bag_message.typestore(ros2)
 
-def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", rig: Rig) -> Messages:
-    """The extrinsic calibration of the IMU, then a message per sample."""
-    driver, imu, store = DRIVERS[rig.driver], rig.imu, serializer.store
-    if imu is None:
-        return
-    if imu.T_lidar_imu is not None:
-        placed = bag.add_connection(_STATIC_TRANSFORMS, bag_message.TRANSFORMS_TYPE, typestore=store)
-        parent = made.header(store, CLOCK_START_NS, driver.frame_id)
-        message = made.transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
-        yield placed, CLOCK_START_NS, serializer.serialized(message)
-    connection = bag.add_connection(driver.imu_topic, _IMU_TYPE, typestore=store)
-    orientation, unknown = store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
-    no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition requires
-    for number, stamp in enumerate(imu.stamps):
-        stamp_ns = clock_ns(stamp)
-        sample = store.types[_IMU_TYPE](
-            header=made.header(store, stamp_ns, driver.imu_frame_id, number),
-            orientation=orientation,
-            orientation_covariance=no_orientation,
-            angular_velocity=made.vector(store, imu.angular_velocities[number]),
-            angular_velocity_covariance=unknown,
-            linear_acceleration=made.vector(store, imu.accelerations[number]),
-            linear_acceleration_covariance=unknown,
-        )
-        yield connection, stamp_ns, serializer.serialized(sample)
+    def _connection(self, topic: str, message_type: str) -> Any:
+        return self._bag.add_connection(topic, message_type, typestore=self._store)
 
+    def clouds(self, scans: Iterable[SimulatedScan], sweep_s: float) -> Messages:
+        """A message per scan, published, and recorded, when its last point has been measured."""
+        connection = self._connection(self._driver.topic, self._driver.message_type)
+        latency_ns = round(1e9 * sweep_s)
+        for number, simulated in enumerate(scans):
+            stamp_ns = clock_ns(simulated.scan.stamp)
+            header = made.header(self._store, stamp_ns, self._driver.frame_id, number)
+            records = self._driver.records(simulated, stamp_ns)
+            if self._driver.message_type == _CUSTOM_MESSAGE:
+                raw = self._custom_message(header, stamp_ns, records)
+            else:
+                raw = bag_message.serialize(made.point_cloud(self._store, header, records), self._ros2)
+            yield connection, stamp_ns + latency_ns, raw
 
-class MessageSerializer:
-    """Serialises clouds for ROS 1 (packed) or ROS 2 (CDR)."""
-
-    def __init__(self, ros2: bool) -> None:
-        self._ros2 = ros2
-        self.store = bag_message.typestore(ros2)
-
-    def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
-        """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
-        message_header = made.header(self.store, stamp_ns, driver.frame_id, sequence)
-        if driver.message_type != _CUSTOM_MESSAGE:
-            return self.serialized(made.point_cloud(self.store, message_header, records))
-        rsvd = np.zeros(3, np.uint8)
-        message = self.store.types[_CUSTOM_MESSAGE](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
+    def _custom_message(self, header: Any, stamp_ns: int, records: Records) -> bytes:
+        """Livox's own message with these points (N,)."""
+        rsvd, size = np.zeros(3, np.uint8), records.dtype.itemsize
+        message = self._store.types[_CUSTOM_MESSAGE](header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
         # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
         # empty list, which ends the message with its length.
-        without_points = self.serialized(message)[:-4]
-        return without_points + len(records).to_bytes(4, "little") + self._packed(records)
+        without_points = bag_message.serialize(message, self._ros2)[:-4]
+        padding = -size % _CDR_ALIGNMENT if self._ros2 else 0  # of all points but the last
+        rows = np.pad(np.frombuffer(records.tobytes(), np.uint8).reshape(-1, size), ((0, 0), (0, padding)))
+        return without_points + len(records).to_bytes(4, "little") + rows.tobytes()[: rows.size - padding]
 
-    def serialized(self, message: Any) -> bytes:
-        """The bytes of a message."""
-        return bag_message.serialize(message, self._ros2)
-
-    def _packed(self, records: Records) -> bytes:
-        """Points one after the other; in CDR each begins at a multiple of four bytes."""
-        size = records.dtype.itemsize
-        if not self._ros2 or not len(records):
-            return records.tobytes()
-        aligned = np.zeros((len(records), -(-size // _CDR_ALIGNMENT) * _CDR_ALIGNMENT), np.uint8)
-        aligned[:, :size] = np.frombuffer(records.tobytes(), np.uint8).reshape(-1, size)
-        return aligned.tobytes()[: aligned.size - (aligned.shape[1] - size)]  # nothing follows that needs alignment
+    def imu(self, imu: ImuSamples | None) -> Messages:
+        """The extrinsic calibration of the IMU, then a message per sample."""
+        if imu is None:
+            return
+        store, frame_id = self._store, self._driver.imu_frame_id
+        if imu.T_lidar_imu is not None:
+            placed = self._connection(_STATIC_TRANSFORMS, bag_message.TRANSFORMS_TYPE)
+            parent = made.header(store, CLOCK_START_NS, self._driver.frame_id)
+            message = made.transforms(store, (parent, frame_id, imu.T_lidar_imu))
+            yield placed, CLOCK_START_NS, bag_message.serialize(message, self._ros2)
+        connection = self._connection(self._driver.imu_topic, _IMU_TYPE)
+        orientation, unknown = store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
+        no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition requires
+        for number, stamp in enumerate(imu.stamps):
+            stamp_ns = clock_ns(stamp)
+            sample = store.types[_IMU_TYPE](
+                header=made.header(store, stamp_ns, frame_id, number),
+                orientation=orientation,
+                orientation_covariance=no_orientation,
+                angular_velocity=made.vector(store, imu.angular_velocities[number]),
+                angular_velocity_covariance=unknown,
+                linear_acceleration=made.vector(store, imu.accelerations[number]),
+                linear_acceleration_covariance=unknown,
+            )
+            yield connection, stamp_ns, bag_message.serialize(sample, self._ros2)

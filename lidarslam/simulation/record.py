@@ -49,8 +49,6 @@ class RecordRequest:
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """A recording that was made."""
-
     source: Path  # the argument for `lidarslam run`
     rate_hz: float  # of the sensor, sweeps a second
     scans: int
@@ -202,7 +200,6 @@ _CHUNK = 10
 
 
 def make_simulation(request: RecordRequest) -> Simulation:
-    """The simulation that was asked for."""
     parts = (request.world, request.sensor, request.motion, request.mount)
     return simulation_of(*parts, request.scans, request.seed, request.speed_mps)
 

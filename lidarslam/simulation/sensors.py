@@ -91,7 +91,6 @@ class Rosette:
         return float(np.hypot(nod, 2.0 * np.pi * self.turns_per_sweep / self.columns))
 
     def rays(self, scan_index: int) -> Rays:
-        """The rays of the sweep with that index."""
         fractions = np.arange(self.columns) / self.columns
         sweeps = scan_index + fractions[:, None]
         number = np.arange(self.lasers)
@@ -125,7 +124,6 @@ class RisleyPrisms:
         return float(np.deg2rad(self.radius_deg) * np.pi * sum(self.turns_per_sweep) / self.columns)
 
     def rays(self, scan_index: int) -> Rays:
-        """The rays of the sweep with that index."""
         fractions = np.arange(self.columns) / self.columns
         one, other = 2.0 * np.pi * np.multiply.outer(self.turns_per_sweep, scan_index + fractions)
         radius = 0.5 * np.deg2rad(self.radius_deg)
@@ -172,7 +170,6 @@ class Sensor:
 
     @property
     def period_s(self) -> float:
-        """Duration of a sweep."""
         return 1.0 / self.rate_hz
 
 
@@ -277,5 +274,4 @@ SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in _TABLE}
 
 
 def find_sensor(name: str) -> Sensor:
-    """The sensor of that name."""
     return choose("sensor", name, SENSORS)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -128,7 +127,6 @@ class Format:
         return folder / self.source.format(name=folder.name)
 
 
-_BAG_MESSAGES = "with the messages of the sensor's own driver, stamped at the start of each sweep"
 _KITTI_LAYOUT = (
     "the layout of the KITTI odometry benchmark. As there, the scans are motion compensated, here exactly and to the"
     " stamp at the start of the sweep; there is no per-point time; every point lies 0.205 degrees too low, which"
@@ -138,30 +136,28 @@ _PLY_LAYOUT = (
     "one binary PLY file a scan, with x, y, z in metres, intensity, t in nanoseconds from the scan's stamp, and ring;"
     " timestamps.txt has a stamp a line, seconds since 1970"
 )
-_ROSBAG2_LAYOUT = f"a ROS 2 bag (SQLite) {_BAG_MESSAGES}; the folder is the bag"
-_MCAP_LAYOUT = f"a ROS 2 bag (MCAP) {_BAG_MESSAGES}; the folder is the bag, and its .mcap file can be read alone"
-
+_PLY_FILES = ("scan_*.ply", "timestamps.txt", "imu.csv")
 _IMU_TABLE = "imu.csv has its samples, stamped by the same clock, and T_lidar_imu in its first line"
 _IMU_MESSAGES = "its messages are sensor_msgs/Imu on the topic of the sensor's driver, and /tf_static has T_lidar_imu"
 
 
-def _write_bag(
-    folder: Path, scans: Iterable[SimulatedScan], rig: Rig, kind: Literal["rosbag1", "rosbag2", "mcap"]
-) -> None:
-    from lidarslam.simulation.bag_writer import write_bag
+def _bag(
+    kind: Literal["rosbag1", "rosbag2", "mcap"], what: str, files: tuple[str, ...], source: str = "", use: str = ""
+) -> Format:
+    def write(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
+        from lidarslam.simulation.bag_writer import write_bag  # takes a while to load
 
-    write_bag(folder, scans, rig, kind)
+        write_bag(folder, scans, rig, kind)
+
+    messages = "with the messages of the sensor's own driver, stamped at the start of each sweep"
+    return Format(write, f"{what} {messages}{use}", files, source, _IMU_MESSAGES)
 
 
-_PLY_FILES = ("scan_*.ply", "timestamps.txt", "imu.csv")
+_ROSBAG2_USE, _MCAP_USE = "; the folder is the bag", "; the folder is the bag, and its .mcap file can be read alone"
 FORMATS: dict[str, Format] = {
     "kitti": Format(write_kitti, _KITTI_LAYOUT, ("sequences", "poses"), clock_start_ns=0),
     "ply": Format(write_ply_scans, _PLY_LAYOUT, _PLY_FILES, imu=_IMU_TABLE),
-    "rosbag1": Format(
-        partial(_write_bag, kind="rosbag1"), f"a ROS 1 bag {_BAG_MESSAGES}", ("*.bag",), "{name}.bag", _IMU_MESSAGES
-    ),
-    "rosbag2": Format(
-        partial(_write_bag, kind="rosbag2"), _ROSBAG2_LAYOUT, ("metadata.yaml", "*.db3"), imu=_IMU_MESSAGES
-    ),
-    "mcap": Format(partial(_write_bag, kind="mcap"), _MCAP_LAYOUT, ("metadata.yaml", "*.mcap"), imu=_IMU_MESSAGES),
+    "rosbag1": _bag("rosbag1", "a ROS 1 bag", ("*.bag",), source="{name}.bag"),
+    "rosbag2": _bag("rosbag2", "a ROS 2 bag (SQLite)", ("metadata.yaml", "*.db3"), use=_ROSBAG2_USE),
+    "mcap": _bag("mcap", "a ROS 2 bag (MCAP)", ("metadata.yaml", "*.mcap"), use=_MCAP_USE),
 }

@@ -6,6 +6,7 @@ import random
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -45,7 +46,6 @@ class MapTeacher:
         self._is_ok: list[bool] = []
 
     def follow(self, scan: Scan) -> None:
-        """Register the next scan."""
         if self._R_image_lidar is None:
             self._R_image_lidar = image_axes(scan.points)
         scan = replace(scan, points=scan.points @ self._R_image_lidar.T)
@@ -96,7 +96,6 @@ class Stretch:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether it is simulated for the training, and not a source."""
         return "simulated" in self.identity
 
     def pieces(self) -> Iterator["Stretch"]:
@@ -271,14 +270,7 @@ def prepare_all(stretches: Sequence[Stretch], config: TrainingConfig, cache: Pat
     with handling(signal.default_int_handler):  # a training's own first Ctrl-C only notes the request
         if not where.is_serial:
             _prepare_side_by_side([*learned, *held_out], config, cache, where)
-        done, total = 0, sum(map(len, stretches))
-        with show_count("preparing recordings") as show:
-
-            def count(more: int) -> None:
-                nonlocal done
-                done += more
-                show(done, total)
-
+        with _counting("preparing recordings", stretches) as count:
             return Recordings(
                 learned=prepared(learned, config, cache, count),
                 held_out=prepared(held_out, config, cache, count),
@@ -289,18 +281,25 @@ def prepare_all(stretches: Sequence[Stretch], config: TrainingConfig, cache: Pat
 def _prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, where: Where) -> None:
     pieces = [piece for stretch in stretches for piece in stretch.pieces()]
     wanted = [piece for piece in pieces if not file_of(piece, config, cache).is_file()]
-    done, total = 0, sum(map(len, wanted))
-
-    def count(index: int, _: object) -> None:
-        nonlocal done
-        done += len(wanted[index])
-        show(done, total)
-
     prepare_one = partial(_prepare_one, config=config, cache=cache.absolute())
-    with show_count("preparing side by side") as show, open_tasks(where) as tasks:
-        deque(tasks.run(prepare_one, wanted, count), maxlen=0)
+    with _counting("preparing side by side", wanted) as count, open_tasks(where) as tasks:
+        deque(tasks.run(prepare_one, wanted, lambda index, _: count(len(wanted[index]))), maxlen=0)
     if not all(file_of(piece, config, cache).is_file() for piece in wanted):
         raise OutputError(f"{cache}: is not shared by the nodes of the cluster; name a folder that is with --prepared")
+
+
+@contextmanager
+def _counting(words: str, stretches: Sequence[Stretch]) -> Iterator[Counter]:
+    """A bar of the scans that are prepared."""
+    done, total = 0, sum(map(len, stretches))
+    with show_count(words) as show:
+
+        def count(more: int) -> None:
+            nonlocal done
+            done += more
+            show(done, total)
+
+        yield count
 
 
 def _prepare_one(piece: Stretch, config: TrainingConfig, cache: Path) -> None:

@@ -84,9 +84,6 @@ class Progress:
     data: str = ""  # digest of the recordings
 
 
-_SHAPE = TypeAdapter(Progress)
-
-
 def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
     """Write the file, whole or not at all; OutputError where it cannot be written."""
     tensors: dict[str, Tensor] = {f"{_NETWORK}/{name}": value for name, value in network.state_dict().items()}
@@ -115,7 +112,7 @@ def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer)
             moments.setdefault(int(number), {})[key] = tensor
         network.load_state_dict(weights)
         optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-        return _SHAPE.validate_python(content)
+        return TypeAdapter(Progress).validate_python(content)
     except (RuntimeError, ValueError, IndexError) as error:
         raise InputError(
             f"{path}: does not belong to this network; go on with the configuration it was begun with"
@@ -134,11 +131,9 @@ class TrainingLog:
         self._curves = SummaryWriter(str(out / CURVES), purge_step=step + 1 if step else None)
 
     def losses(self, step: int, row: Mapping[str, float]) -> None:
-        """Means since the last line."""
         self._write(LOSSES, "training", step, row)
 
     def validation(self, step: int, result: Validation) -> None:
-        """Errors on held-out recordings."""
         values = vars(result).copy()
         for k, percent in enumerate(values.pop("covered_percent"), start=1):
             values[f"covered_{k}_sigma_percent"] = percent
@@ -146,7 +141,6 @@ class TrainingLog:
         self._curves.flush()
 
     def close(self) -> None:
-        """Write the rest."""
         self._curves.close()
 
     def _write(self, table: str, curves: str, step: int, row: Mapping[str, float]) -> None:
@@ -203,7 +197,6 @@ def format_validation(step: int, result: Validation, improves: bool) -> str:
 
 
 def format_errors(result: Validation) -> str:
-    """Errors of the motions."""
     return (
         f"off by {result.rotation_rms_deg:.3f} deg and {result.translation_rms_m:.3f} m RMS"
         f" (median {result.rotation_median_deg:.3f} deg, {result.translation_median_m:.3f} m)"

@@ -7,13 +7,13 @@ previous one over all shifts by the fast Fourier transform, and each peak there 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, make_transform, rotation_z
 from lidarslam.odometry.images.bird_eye import MOST_CELLS, bird_eye
 from lidarslam.odometry.images.projection import Floats
 
@@ -68,30 +68,22 @@ class Search(Protocol):
         """The candidates, the most probable first, of the motion of a scan (3, H, W), and its features."""
 
 
-class CorrelationParts(NamedTuple):
-    """The parts of the network `correlation`."""
+@dataclass(frozen=True, eq=False)
+class CorrelationSearch:
+    """The search with the parts of the network `correlation`; implements `Search`."""
 
     columns: Graph  # points and normals (1, 3, H, W) -> features (1, C, H', W')
     turns: Graph  # features (1, C, H', W') of the previous and the current scan -> scores (1, W')
     bird: Graph  # grid (1, CHANNELS, CELLS, CELLS) -> features (1, F, CELLS, CELLS)
     peaks: Graph  # scores (1, W') and (1, SHIFTS, SHIFTS) -> turn (1,), radians; shift (1, 2), metres; log sigma (1, 6)
 
-
-class CorrelationSearch:
-    """The search with the network `correlation`; implements `Search`."""
-
-    def __init__(self, parts: CorrelationParts) -> None:
-        self._parts = parts
-
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
-        """See `Search`."""
-        (columns,) = self._parts.columns(points[None], normals[None])
+        (columns,) = self.columns(points[None], normals[None])
         return Described(columns, self._spectrum(points, normals, heading), heading)
 
     def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
-        """See `Search`."""
-        (columns,) = self._parts.columns(points[None], normals[None])
-        (turn_scores,) = self._parts.turns(previous.columns, columns)
+        (columns,) = self.columns(points[None], normals[None])
+        (turn_scores,) = self.turns(previous.columns, columns)
         found: list[tuple[float, Candidate, Described]] = []
         for turns in _peaks(turn_scores, _TURNS, _NEAR_COLUMNS):
             angle = float(turns[0].argmax()) * (2.0 * math.pi / turns.shape[1])
@@ -115,39 +107,31 @@ class CorrelationSearch:
         return kept, found[0][2]
 
     def _spectrum(self, points: Floats, normals: Floats, heading: float) -> NDArray[np.complex64]:
-        (features,) = self._parts.bird(bird_eye(points, normals, heading)[None])
+        (features,) = self.bird(bird_eye(points, normals, heading)[None])
         return np.asarray(fft.rfft2(features[0]), dtype=np.complex64)
 
     def _candidate(self, previous: Described, turns: Floats, shifts: Floats) -> Candidate:
-        angle, shift, log_sigma = (values[0] for values in self._parts.peaks(turns, shifts))
+        angle, shift, log_sigma = (values[0] for values in self.peaks(turns, shifts))
         # The shift is seen in the frame of the previous grid, which is turned by its heading.
-        c, s = math.cos(previous.heading), math.sin(previous.heading)
-        back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        turn = float(angle)
-        T = np.eye(4)
-        T[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-        T[:3, 3] = back @ [shift[0], shift[1], 0.0]
-        axes = np.zeros((6, 6))
-        axes[:3, :3], axes[3:, 3:] = back, back
+        back = rotation_z(-previous.heading)
+        T_prev_curr = make_transform(rotation_z(float(angle)), back @ [shift[0], shift[1], 0.0])
+        axes = np.kron(np.eye(2), back)
         variances = np.exp(2.0 * log_sigma.astype(np.float64))
-        return Candidate(T, axes @ np.diag(variances) @ axes.T, 0.0)
+        return Candidate(T_prev_curr, axes @ np.diag(variances) @ axes.T, 0.0)
 
 
+@dataclass(frozen=True, eq=False)
 class WholePairs:
     """The search with a network without parts, whose one motion is the only candidate; implements `Search`."""
 
-    def __init__(self, network: Graph) -> None:
-        # Points and normals (1, 6, H, W) of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
-        self._network = network
+    network: Graph  # points and normals (1, 6, H, W) of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6)
 
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
-        """The image itself."""
         return Described(np.concatenate([points, normals])[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
 
     def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
-        """See `Search`."""
         current = self.describe(points, normals)
-        T_prev_curr, log_sigma = self._network(previous.columns, current.columns)
+        T_prev_curr, log_sigma = self.network(previous.columns, current.columns)
         variances = np.exp(2.0 * log_sigma[0].astype(np.float64))
         return (Candidate(T_prev_curr[0].astype(np.float64), np.diag(variances), 0.0),), current
 

@@ -25,17 +25,8 @@ from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.images.projection import Floats
-from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
-from lidarslam.odometry.network.exported import (
-    BIRD,
-    COLUMNS,
-    DESCRIPTION,
-    PAIR,
-    PEAKS,
-    TURNS,
-    describe,
-    read_description,
-)
+from lidarslam.odometry.network import exported
+from lidarslam.odometry.network.candidates import CorrelationSearch, Graph, Search, WholePairs
 from lidarslam.odometry.network.networks import CorrelationNetwork, make_network, of_two_images
 
 _PROGRAM = "lidarslam"
@@ -114,7 +105,7 @@ def checkpoint_of(
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write the file, whole or not at all; OutputError where it cannot be written."""
-    content = describe(checkpoint.network, checkpoint.images) | {"about": checkpoint.about}
+    content = exported.describe(checkpoint.network, checkpoint.images) | {"about": checkpoint.about}
     write_tensor_file(path, WEIGHTS, checkpoint.weights, content)
 
 
@@ -125,7 +116,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """
     weights, content = read_tensor_file(path, WEIGHTS)
     try:
-        checkpoint = Checkpoint(*read_description(content), weights, content.get("about") or {})
+        checkpoint = Checkpoint(*exported.read_description(content), weights, content.get("about") or {})
         expected = network_of(checkpoint).state_dict()
         for name, value in weights.items():
             if value.dtype != expected[name].dtype or not bool(value.isfinite().all()):
@@ -170,8 +161,7 @@ def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads
 
     if isinstance(network, CorrelationNetwork):
         parts = (network.columns, network.turn_scores, network.bird, network.peaks)
-        return CorrelationSearch(CorrelationParts(*(graph(part) for part in parts)))
-
+        return CorrelationSearch(*(graph(part) for part in parts))
     return WholePairs(graph(of_two_images(network)))
 
 
@@ -195,7 +185,6 @@ class _Function(nn.Module):
         self.network, self.function = network, function
 
     def forward(self, *inputs: Tensor) -> Any:
-        """Call it."""
         return self.function(*inputs)
 
 
@@ -214,9 +203,9 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
             folder = Path(workplace)
             for graph in graphs:
                 _write(_Function(network, graph.function).eval(), graph, folder / graph.name)
-            description = describe(checkpoint.network, checkpoint.images)
-            (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
-            names = [*(graph.name for graph in graphs), DESCRIPTION]
+            description = exported.describe(checkpoint.network, checkpoint.images)
+            (folder / exported.DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+            names = [*(graph.name for graph in graphs), exported.DESCRIPTION]
             for name in names:
                 (folder / name).replace(out / name)
     except OSError as error:
@@ -229,16 +218,16 @@ def _graphs(network: nn.Module, rows: int, columns: int) -> list[_Graph]:
     if not isinstance(network, CorrelationNetwork):
         images = torch.cat([points, normals], dim=1)
         takes, gives = ["previous", "current"], ["T_prev_curr", "log_sigma"]
-        return [_Graph(PAIR, of_two_images(network), (images, images + 1.0), takes, gives)]
+        return [_Graph(exported.PAIR, of_two_images(network), (images, images + 1.0), takes, gives)]
     with torch.no_grad():
         features = network.columns(points, normals)
     grids = torch.rand(_EXAMPLE_BATCH, bird_eye.CHANNELS, bird_eye.CELLS, bird_eye.CELLS)
     scores = torch.rand(_EXAMPLE_BATCH, features.shape[-1]), torch.rand(_EXAMPLE_BATCH, SHIFTS, SHIFTS)
     return [
-        _Graph(COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
-        _Graph(TURNS, network.turn_scores, (features, features.flip(0)), ["previous", "current"], ["scores"]),
-        _Graph(BIRD, network.bird, (grids,), ["grids"], ["features"]),
-        _Graph(PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),
+        _Graph(exported.COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
+        _Graph(exported.TURNS, network.turn_scores, (features, features.flip(0)), ["previous", "current"], ["scores"]),
+        _Graph(exported.BIRD, network.bird, (grids,), ["grids"], ["features"]),
+        _Graph(exported.PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),
     ]
 
 

@@ -12,7 +12,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.images.projection import Floats
-from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
+from lidarslam.odometry.network.candidates import CorrelationSearch, Graph, Search, WholePairs
 
 DESCRIPTION = "network.json"
 COLUMNS, TURNS, BIRD, PEAKS, PAIR = "columns.onnx", "turns.onnx", "bird.onnx", "peaks.onnx", "pair.onnx"
@@ -53,8 +53,7 @@ def load_exported(folder: Path, threads: int) -> tuple[Search, ImageConfig]:
         ) from error
     if network.name != "correlation":
         return WholePairs(_graph(folder / PAIR, threads)), images
-    parts = (_graph(folder / name, threads) for name in (COLUMNS, TURNS, BIRD, PEAKS))
-    return CorrelationSearch(CorrelationParts(*parts)), images
+    return CorrelationSearch(*(_graph(folder / name, threads) for name in (COLUMNS, TURNS, BIRD, PEAKS))), images
 
 
 def _graph(path: Path, threads: int) -> Graph:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
-from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, _peaks
+from lidarslam.odometry.network.candidates import CorrelationSearch, _peaks
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 from lidarslam.odometry.network.networks import CorrelationNetwork
 from lidarslam.odometry.registry import default_weights
@@ -63,13 +63,12 @@ def test_candidates_are_a_distribution(network, seen):
 def known(turn_scores: np.ndarray) -> CorrelationSearch:
     """With parts that find one turn and one shift in any scan."""
     log_sigma = np.log(np.float32([[0.01, 0.02, 0.03, 0.1, 0.2, 0.3]]))
-    parts = CorrelationParts(
+    return CorrelationSearch(
         columns=lambda *_: [np.zeros((1, 4, 4, 180), dtype=np.float32)],
         turns=lambda *_: [turn_scores],
         bird=lambda grid: [np.zeros((1, 8, *grid.shape[2:]), dtype=np.float32)],
         peaks=lambda *_: [np.float32([0.2]), np.float32([[2.0, 1.0]]), log_sigma],
     )
-    return CorrelationSearch(parts)
 
 
 def test_what_was_seen_in_a_turned_grid_is_turned_back():

@@ -36,11 +36,11 @@ def a_scan(seed: int, shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.nd
 
 def test_the_shipped_graphs_are_the_shipped_weights():
     """Else they were exported from others: `lidarslam export --out odometry/weights/correlation` makes them again."""
-    checkpoint, (exported, images) = checkpoints.load_checkpoint(default_weights()), load_exported(shipped_folder(), 1)
+    checkpoint, (given, images) = checkpoints.load_checkpoint(default_weights()), load_exported(shipped_folder(), 1)
     assert images == checkpoint.images
-    searches = exported, checkpoints.torch_search(checkpoints.network_of(checkpoint))
-    assert all(isinstance(search, CorrelationSearch) for search in searches)
-    given, expected = (search._parts for search in searches)  # type: ignore[attr-defined]
+    expected = checkpoints.torch_search(checkpoints.network_of(checkpoint))
+    assert isinstance(given, CorrelationSearch)
+    assert isinstance(expected, CorrelationSearch)
     points, normals = a_scan(0, (checkpoint.images.rows, checkpoint.images.columns))
     rng = np.random.default_rng(0)
     grid = rng.normal(size=(1, 8, 96, 96)).astype(np.float32) * (rng.random((1, 1, 96, 96)) > 0.6)

@@ -13,7 +13,8 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.published.kitti import read_entry, read_tr
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer
+from lidarslam.datasets.ros.bag_message import typestore
+from lidarslam.simulation.bag_writer import DRIVERS
 from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_ns
 from lidarslam.simulation.writers import FORMATS, T_CAM_LIDAR
 
@@ -118,7 +119,7 @@ def messages(name, driver, folder, sweeps, rig):
     """Record stamp and message, decoded by rosbags with the definitions in the bag, with the sweep it was made of."""
     FORMATS[name].write(folder, iter(sweeps), replace(rig, driver=driver))
     source = FORMATS[name].source_in(folder)
-    store = MessageSerializer(ros2=name != "rosbag1").store
+    store = typestore(ros2=name != "rosbag1")
     with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(source) as reader:
         deserialize = store.deserialize_ros1 if name == "rosbag1" else store.deserialize_cdr
         found = [(record_ns, deserialize(raw, c.msgtype)) for c, record_ns, raw in reader.messages()]
