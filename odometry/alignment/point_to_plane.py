@@ -17,7 +17,6 @@ from lidarslam.core.compiled import compiled, compiled_part, compiled_sums
 from lidarslam.core.geometry import FloatArray
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.projection import Floats, arc_tangent
-from lidarslam.odometry.images.sweep_images import SweepImages
 
 # Points that are worked on together.
 _BLOCK = 256
@@ -300,8 +299,15 @@ class PointToPlane:
     """The points of every `column_step`-th column of the current sweep against the planes of the previous one."""
 
     def __init__(self, sweeps: SweepPair, column_step: int) -> None:
-        self._points, self._count = _points(sweeps.current, column_step)
-        self._planes = _planes(sweeps.previous)
+        current, previous = sweeps.current, sweeps.previous
+        height, width = current.offsets.shape
+        fewer = max(1, height // _FULL_ROWS)  # of more rows fewer points each
+        self._points = np.empty((7, height * (width // (fewer * column_step) + 1)), dtype=np.float32)
+        self._count = _sample(current.points, current.normals, current.offsets, column_step, fewer, self._points)
+        height, width = previous.offsets.shape
+        pixels = np.empty((height * width, 7), dtype=np.float32)
+        _fill(previous.points, previous.normals, previous.offsets, min(_FILL_COLUMNS, width - 1), pixels)
+        self._planes = Planes(pixels, height, width, previous.low, previous.high, bool(previous.offsets.any()))
 
     def normal_equations(self, motion: PairMotion, scale_m: float) -> tuple[FloatArray, FloatArray]:
         """H (12, 12) and g (12,) of squared residuals with Geman and McClure's weights of this scale.
@@ -317,21 +323,6 @@ class PointToPlane:
         total, in_view, inlier = np.zeros((13, 13)), np.zeros((3, 3)), np.zeros((3, 3))
         seen, count = _sum_up(self._points, self._count, self._planes, motion, FINE_M, False, total, in_view, inlier)
         return InlierSums(total[:12, :12], in_view, inlier, seen / max(self._count, 1), count)
-
-
-def _points(images: SweepImages, column_step: int) -> tuple[Floats, int]:
-    """(7, N or more) point, normal and seconds of pixels that have a normal, and N; of more rows fewer each."""
-    height, width = images.offsets.shape
-    fewer = max(1, height // _FULL_ROWS)
-    room = np.empty((7, height * (width // (fewer * column_step) + 1)), dtype=np.float32)
-    return room, _sample(images.points, images.normals, images.offsets, column_step, fewer, room)
-
-
-def _planes(images: SweepImages) -> Planes:
-    height, width = images.offsets.shape
-    pixels = np.empty((height * width, 7), dtype=np.float32)
-    _fill(images.points, images.normals, images.offsets, min(_FILL_COLUMNS, width - 1), pixels)
-    return Planes(pixels, height, width, images.low, images.high, bool(images.offsets.any()))
 
 
 @compiled

@@ -87,8 +87,7 @@ def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
     Points that are not finite, at the origin, or above or below a grid are left out.
     """
     x, y, z, ranges, elevations, azimuths = np.empty((6, len(points)), dtype=np.float32)
-    _write_coordinates(np.ascontiguousarray(points, dtype=np.float64), x, y, z, ranges)
-    write_angles(x, y, z, elevations, azimuths)
+    _write_coordinates(np.ascontiguousarray(points, dtype=np.float64), x, y, z, ranges, elevations, azimuths)
     projections = []
     for grid in grids:
         nearest = np.full(grid.rows * grid.columns, _NONE)
@@ -102,11 +101,18 @@ def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
 
 
 @compiled
-def _write_coordinates(points: FloatArray, x: Floats, y: Floats, z: Floats, ranges: Floats) -> None:
+def _write_coordinates(
+    points: FloatArray, x: Floats, y: Floats, z: Floats, ranges: Floats, elevations: Floats, azimuths: Floats
+) -> None:
+    """Write the coordinates of points (N, 3) and their angles to single precision, in vectorised loops."""
     for i in range(len(points)):
         x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
     for i in range(len(points)):
         ranges[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+    for i in range(len(points)):
+        elevations[i] = arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
+    for i in range(len(points)):
+        azimuths[i] = arc_tangent(y[i], x[i])
 
 
 @compiled
@@ -174,15 +180,6 @@ def _column_of(azimuth: float, width: int) -> float:
     azimuth = azimuth + _TURN if azimuth < 0.0 else azimuth
     column = np.floor(azimuth * (width / _TURN))
     return column if column < width - 1.0 else width - 1.0  # NaN lies in the last column
-
-
-@compiled
-def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: Floats) -> None:
-    """Write the angles of points to single precision, in vectorised loops."""
-    for i in range(len(x)):
-        elevations[i] = arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
-    for i in range(len(x)):
-        azimuths[i] = arc_tangent(y[i], x[i])
 
 
 @compiled_part

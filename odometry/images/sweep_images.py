@@ -1,6 +1,6 @@
 """Scans as the range images that the network and alignment work on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -100,7 +100,7 @@ class Imager(Stateful):
         if self._alignment_rows == grid.rows:
             coarse = _images(project(points, [grid])[0], grid, scan)
             return ScanImages(coarse, coarse, self._R_image_lidar)
-        fine = ImageGrid(self._alignment_rows, grid.columns, grid.elevation_low, grid.elevation_high)
+        fine = replace(grid, rows=self._alignment_rows)
         shown = project(points, [grid, fine])
         network, alignment = _images(shown[0], grid, scan), _images(shown[1], fine, scan, is_fine=True)
         _fill_near(alignment.normals, shown[1].image[3], network.normals, shown[0].image[3])
@@ -160,5 +160,4 @@ def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageG
 
 def _shown(points: Points, grid: ImageGrid, rows: int) -> NDArray[np.bool_]:
     """(rows, W) which pixels have a point, in an image with this many rows."""
-    fine = ImageGrid(rows, grid.columns, grid.elevation_low, grid.elevation_high)
-    return project(points, [fine])[0].index >= 0
+    return project(points, [replace(grid, rows=rows)])[0].index >= 0
