@@ -236,9 +236,10 @@ def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     cells = (row[:, None, None] + around[:, None]) * count + column[:, None, None] + around  # (B, 5, 5)
     near = likelihood.gather(1, cells.flatten(1))
     share = near.softmax(dim=1).reshape(-1, 2 * _PEAK + 1, 2 * _PEAK + 1)
-    shares = torch.stack([share.sum(dim=1), share.sum(dim=2)], dim=1)  # over rows: along x; over columns: along y
-    mean = (shares * around).sum(dim=2)
-    variance = (shares * around.square()).sum(dim=2) - mean.square()
+    across, along = share.sum(dim=1), share.sum(dim=2)  # over rows: along x; over columns: along y
+    mean = torch.stack([(across * around).sum(dim=1), (along * around).sum(dim=1)], dim=1)
+    squares = torch.stack([(across * around.square()).sum(dim=1), (along * around.square()).sum(dim=1)], dim=1)
+    variance = squares - mean.square()
     cell = torch.stack([column, row], dim=1) - count // 2 + mean
     entropy = -(likelihood.exp() * likelihood).sum(dim=1)
     far = (cell.square().sum(dim=1) + 1.0).log()

@@ -170,8 +170,11 @@ def motion_error(T_prev_curr: Tensor, target: Tensor) -> Tensor:
 
 def _distance(error: Tensor) -> Tensor:
     """(B,) rotation and translation, each in its unit, squared when small and linear when large."""
-    sizes = torch.stack([error[:, :3].norm(dim=1) / _ROTATION, error[:, 3:].norm(dim=1) / _TRANSLATION_M], dim=1)
-    return functional.smooth_l1_loss(sizes, torch.zeros_like(sizes), reduction="none").sum(dim=1)
+    rotation = error[:, :3].norm(dim=1) / _ROTATION
+    translation = error[:, 3:].norm(dim=1) / _TRANSLATION_M
+    return functional.smooth_l1_loss(
+        torch.stack([rotation, translation], dim=1), error.new_zeros(len(error), 2), reduction="none"
+    ).sum(dim=1)
 
 
 def _negative_log_likelihood(error: Tensor, log_sigma: Tensor) -> Tensor:
